@@ -40,36 +40,14 @@ def test_any_masks(pupil, screens, masks):
     assert np.all(faster.n_iterations < plain.n_iterations)
 
 
-def test_wider_range_than_the_plain_iteration():
-    pupil = zwfs.Pupil.circular(48)
-    sensor = pair(pupil)
-    phase = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 200), 1.9, 40, seed=3)
-    frames = sensor.measure(phase)
-    found = []
-    for accelerate in (False, True):
-        estimate = PhaseShifted(sensor, accelerate=accelerate)(frames).phase
-        found.append(np.count_nonzero(reconstruction_error(pupil, estimate, phase) < 0.1))
-    assert found[1] > found[0] + 5
-
-
-def test_a_start_is_not_dimmed(pupil, screens):
-    sensor, phase = pair(pupil), screens(0.8, 1)[0]
-    frames = sensor.measure(phase)
-    assert errors_after_one(sensor, frames, phase, start=phase) < 1e-10
-    flat = np.zeros(pupil.shape)
-    plain = PhaseShifted(sensor, n_iterations=1)(frames).phase
-    np.testing.assert_allclose(PhaseShifted(sensor, n_iterations=1, accelerate=True)(frames, flat).phase, plain)
-    assert errors_after_one(sensor, frames, phase) < 0.7 * reconstruction_error(pupil, plain, phase)
-
-
 @pytest.mark.parametrize("diameter", [0.6, 1.06, 1.4])
 def test_relaxation_leaves_nothing_of_a_small_tilt(pupil, diameter):
     sensor, tilt = pair(pupil, diameter), np.where(pupil.inside, 1e-2 * pupil.x, 0)
-    left = {}
+    shares = {}
     for accelerate in (False, True):
-        found = PhaseShifted(sensor, n_iterations=2, tolerance=0, accelerate=accelerate)(sensor.measure(tilt))
-        left[accelerate] = reconstruction_error(pupil, found.phase, tilt) / pupil.rms(tilt)
-    assert left[True] < 0.15 * left[False]
+        result = PhaseShifted(sensor, n_iterations=2, tolerance=0, accelerate=accelerate)(sensor.measure(tilt))
+        shares[accelerate] = reconstruction_error(pupil, result.phase, tilt) / pupil.rms(tilt)
+    assert shares[True] < 0.15 * shares[False]
 
 
 def test_relaxation_does_not_depend_on_the_origin():
@@ -79,8 +57,8 @@ def test_relaxation_does_not_depend_on_the_origin():
     pupils = [Pupil.from_amplitude(image, n_pixels=28, center=(15.5, 15.5 + shift)) for shift in (0, 1, 9)]
     frames = pair(pupils[0]).measure(0.5 * np.sin(9 * x / 28))
     options = {"n_iterations": 3, "tolerance": 0, "accelerate": True}
-    found = [PhaseShifted(pair(pupil), **options)(frames).phase for pupil in pupils]
-    np.testing.assert_allclose(found, np.broadcast_to(found[0], (3, *y.shape)), atol=1e-9)
+    phases = [PhaseShifted(pair(pupil), **options)(frames).phase for pupil in pupils]
+    np.testing.assert_allclose(phases, np.broadcast_to(phases[0], (3, *y.shape)), atol=1e-9)
 
 
 @pytest.mark.parametrize("photons", [100, 1000, 1e4])
@@ -136,18 +114,6 @@ def test_frames_that_do_not_converge_do_not_depend_on_their_batch(mismatched):
 def test_a_wrong_flux_leaves_numbers(shifted, screens, pupil, flux):
     method = PhaseShifted(shifted, accelerate=True, tolerance=0)
     assert np.all(np.isfinite(method(flux * shifted.measure(screens(0.5))).phase[:, pupil.inside]))
-
-
-def test_the_secant_ends_where_nothing_changes(shifted, screens, pupil):
-    method = PhaseShifted(shifted, accelerate=True, n_iterations=300, tolerance=0)
-    phase = screens(0.3)
-    found = method(shifted.measure(phase).astype(np.float32)).phase
-    assert reconstruction_error(pupil, found, phase).max() < 1e-5
-
-
-def errors_after_one(sensor, frames, phase, **options):
-    found = PhaseShifted(sensor, n_iterations=1, accelerate=True)(frames, **options)
-    return reconstruction_error(sensor.pupil, found.phase, phase)
 
 
 @pytest.mark.parametrize("phases", [(1.5, -1.5), (0.3, -2.0), (1.5, -1.5, 2.5), (0.0, 1.0, -0.4)])

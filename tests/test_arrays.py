@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 from astropy import units
 
-from zwfs import Arcsine, Dimple, GerchbergSaxton, Linear, PhaseShifted, ZernikeSensor, reconstruction_error
-from zwfs.reconstructors import base
+from zwfs import Arcsine, Dimple, GerchbergSaxton, Linear, PhaseShifted, ZernikeSensor
 
 
 class Library:
@@ -52,11 +51,11 @@ def library(request):
     return LIBRARIES[request.param]()
 
 
-def same(library, found, expected, atol=1e-10):
+def same(library, result, expected, atol=1e-10):
     """Values, precision, and the library and device that they come in."""
-    values, like = library.to_numpy(found), library.array(np.zeros(1))
-    assert type(found) is type(like)
-    assert found.device == like.device
+    values, like = library.to_numpy(result), library.array(np.zeros(1))
+    assert type(result) is type(like)
+    assert result.device == like.device
     assert values.dtype == np.asarray(expected).dtype
     np.testing.assert_allclose(values, expected, atol=atol, rtol=0)
 
@@ -116,17 +115,17 @@ def test_reconstructors(library, pupil, screens, name, batch):
         : np.prod(batch, dtype=int)
     ]
     frames = method.sensor.measure(phase.reshape(*batch, *pupil.shape), method.settings.amplitude)
-    expected, found = method(frames), method(library.array(frames))
+    expected, result = method(frames), method(library.array(frames))
     for attribute in ("phase", "residual", "n_iterations", "converged", "n_unsolved", "frames"):
-        same(library, getattr(found, attribute), getattr(expected, attribute), 1e-9)
+        same(library, getattr(result, attribute), getattr(expected, attribute), 1e-9)
 
 
 def test_history_and_start(library, pupil, screens):
     method = make("accelerated", pupil)
     phase = screens(0.4, 3)
     frames = method.sensor.measure(phase)
-    expected, found = method(frames, history=True), method(library.array(frames), history=True)
-    same(library, found.history, expected.history, 1e-9)
+    expected, result = method(frames, history=True), method(library.array(frames), history=True)
+    same(library, result.history, expected.history, 1e-9)
     same(library, method(library.array(frames), library.array(phase)).phase, method(frames, phase).phase, 1e-9)
 
 
@@ -142,19 +141,8 @@ def test_frames_that_do_not_converge(library, pupil, screens):
 def test_single_precision(library, pupil, screens):
     method, phase = make("real time", pupil), screens(0.4, 2)
     frames = method.sensor.measure(phase).astype(np.float32)
-    found = method(library.array(frames))
-    same(library, found.phase, method(frames).phase, 1e-3)
-    assert reconstruction_error(pupil, library.to_numpy(found.phase), phase).max() < 0.01
-
-
-def test_pieces_are_put_together(library, pupil, screens, monkeypatch):
-    method, frames = make("plain", pupil), make("plain", pupil).sensor.measure(screens(0.4, 5))
-    together = method(library.array(frames))
-    monkeypatch.setattr(base, "_CHUNK", 2 * frames[0].size)
-    monkeypatch.setattr(base, "_CHUNK_ELSEWHERE", 2 * frames[0].size)
-    found = method(library.array(frames))
-    for attribute in ("phase", "n_iterations", "converged", "residual"):
-        same(library, getattr(found, attribute), library.to_numpy(getattr(together, attribute)), 1e-9)
+    result = method(library.array(frames))
+    same(library, result.phase, method(frames).phase, 1e-3)
 
 
 def test_bad_input_is_named(library, pupil):
@@ -198,6 +186,6 @@ def test_others_take_arrays_of_numpy(pupil, modes, screens):
     """Methods that are written for NumPy only answer in NumPy."""
     method = Linear(ZernikeSensor(pupil, PAIR[0]), modes)
     frames = method.sensor.measure(screens(0.1, 2))
-    found = method(array_api_strict.asarray(frames))
-    assert isinstance(found.phase, np.ndarray)
-    np.testing.assert_array_equal(found.phase, method(frames).phase)
+    result = method(array_api_strict.asarray(frames))
+    assert isinstance(result.phase, np.ndarray)
+    np.testing.assert_array_equal(result.phase, method(frames).phase)

@@ -58,7 +58,7 @@ COMPLEX = {"Pupil.gather", "Pupil.scatter", "focal_field"}
 @cache
 def targets():
     """Public callables by name: functions, classes with documented parameters, and the methods of all classes."""
-    found = {}
+    public = {}
     for module in (importlib.import_module(f"zwfs.{name}") for name in MODULES):
         for name, thing in inspect.getmembers(module):  # of a package, too, which imports at the first use
             if (
@@ -68,21 +68,21 @@ def targets():
             ):
                 continue
             if inspect.isfunction(thing):
-                found[name if name not in found else f"{name} of {module.__name__[5:]}"] = thing
+                public[name if name not in public else f"{name} of {module.__name__[5:]}"] = thing
             elif inspect.isclass(thing) and not getattr(thing, "_is_protocol", False):
                 # A class that documents attributes only is a result: functions of the package make it.
                 if inspect.isabstract(thing):
                     continue
                 if "Parameters\n" in (thing.__doc__ or "") or name == "Pupil":
-                    found[name] = thing
+                    public[name] = thing
                 inherited = {"__call__": thing.__call__} if issubclass(thing, Reconstructor) else {}
                 for key, member in (inherited | vars(thing)).items():
                     shown = not key.startswith("_") or key == "__call__"
                     if shown and key not in INTERNAL and callable(getattr(thing, key)):
-                        found[f"{name}.{key}"] = member
-    del found["Bench"]  # 26 parameters at 20 ms a value: see test_bench.py
-    del found["LearnedReference.train"]  # seconds a value: see test_learned.py
-    return found | RESULTS
+                        public[f"{name}.{key}"] = member
+    del public["Bench"]  # 26 parameters at 20 ms a value: see test_bench.py
+    del public["LearnedReference.train"]  # seconds a value: see test_learned.py
+    return public | RESULTS
 
 
 BENCH = Bench(n_pixels=40, n_rings=1, missing=(), photons_per_image=1e8)
@@ -164,9 +164,10 @@ def valid() -> dict:
         "MaximumLikelihood.photons": 1e4,
         "MaximumLikelihood.modes": modes,
         "MaximumLikelihood.prior": np.eye(5),
-        **{f"{name}.sensor": one.sensor for name, one in methods.items()},
-        **{f"{name}.__call__.frames": one.sensor.measure(phase) for name, one in methods.items()},
-        **{f"{name}.__call__.start": 0.1 * phase if one.iterative else None for name, one in methods.items()},
+        **{f"{name}.sensor": method.sensor for name, method in methods.items()},
+        **{f"{name}.__call__.frames": method.sensor.measure(phase) for name, method in methods.items()},
+        **{f"{name}.__call__.start": 0.1 * phase for name, method in methods.items() if method.iterative},
+        **{f"{name}.__call__.start": None for name, method in methods.items() if not method.iterative},
     }  # fmt: skip
     instances = {
         "Pupil": pupil,
@@ -321,9 +322,9 @@ def is_number(array):
 def parameters(name):
     """Parameters of a public callable, without `self` and those of any name."""
     function = targets()[name]
-    found = list(inspect.signature(getattr(function, "__func__", function)).parameters.values())
-    found = found[1:] if "." in name and not isinstance(function, staticmethod) else found
-    return {parameter.name: parameter for parameter in found if parameter.kind is not parameter.VAR_KEYWORD}
+    listed = list(inspect.signature(getattr(function, "__func__", function)).parameters.values())
+    listed = listed[1:] if "." in name and not isinstance(function, staticmethod) else listed
+    return {parameter.name: parameter for parameter in listed if parameter.kind is not parameter.VAR_KEYWORD}
 
 
 class Call:
@@ -344,15 +345,15 @@ class Call:
 
     def argument(self, name):
         """Valid value of a parameter."""
-        parameter, known = self.parameters[name], valid()["arguments"]
+        parameter, arguments = self.parameters[name], valid()["arguments"]
         for key in (f"{self.name}.{name}", f"{self.name.partition('.')[0]}.{name}"):
-            if key in known:
-                return known[key]
+            if key in arguments:
+                return arguments[key]
         if parameter.default is not parameter.empty and name != "seed":
             return parameter.default
-        if name not in known:
+        if name not in arguments:
             raise AssertionError(f"{self.name}: no valid value for its parameter {name}: add one to `valid`")
-        return known[name]
+        return arguments[name]
 
     def expected(self, parameter, plain):
         """Numbers in the result for a plain value of a parameter, computed once."""
@@ -382,8 +383,8 @@ def right(name):
     with np.errstate(all="ignore"):
         longer = "history" in parameters(name) and name not in RESULTS
         results = [Call(name)(), Call(name)(history=True) if longer else None]
-        found = list(leaves(results))
-    return {path[3:] for path, array in found if is_number(array) and not np.isfinite(array).all()}
+        numbers = list(leaves(results))
+    return {path[3:] for path, array in numbers if is_number(array) and not np.isfinite(array).all()}
 
 
 def judge(call, parameter, label, value, plain):
@@ -442,11 +443,11 @@ def test_a_bad_value_is_named(name, parameter):
     values = [(label, value, PLAIN.get(label)) for label, value in (BAD | UNUSUAL).items()]
     values += variants(call.argument(parameter))
     wrong = {
-        label: found
+        label: fault
         for label, value, plain in values
-        if (found := judge(call, parameter, label, value, plain)) is not None
+        if (fault := judge(call, parameter, label, value, plain)) is not None
     }
-    assert not wrong, "\n".join(f"{name}({parameter}={label}): {found}" for label, found in wrong.items())
+    assert not wrong, "\n".join(f"{name}({parameter}={label}): {fault}" for label, fault in wrong.items())
 
 
 PUPIL = zwfs.Pupil.circular(8)

@@ -17,8 +17,8 @@ def jacobian(sensor, phase, amplitude=None, *, of_amplitude=False):
     change = np.exp(1j * phase) if of_amplitude else 1j * field
     field = np.where(pupil.inside, field, 0)
     waves = sensor.propagate(field)
-    each = sensor.propagate(pupil.scatter(np.diag(pupil.gather(change)), fill=0))
-    return 2 * np.real(np.conj(waves) * each).reshape(pupil.n_points, -1)
+    changes = sensor.propagate(pupil.scatter(np.diag(pupil.gather(change)), fill=0))
+    return 2 * np.real(np.conj(waves) * changes).reshape(pupil.n_points, -1)
 
 
 def dense_bound(sensor, phase, photons, read_noise=0.0, modes=None, amplitude=None, amplitude_known=True):
@@ -71,10 +71,10 @@ def test_bound_with_an_unknown_amplitude_is_that_of_a_dense_matrix(small, masks,
     phase, amplitude = rng.normal(0, 0.5, small.shape), rng.uniform(0.5, 1.5, small.shape)
     options = {"photons": 100.0, "read_noise": 1.0, "amplitude": amplitude}
     expected, _ = dense_bound(sensor, phase, amplitude_known=False, **options)
-    known = cramer_rao(sensor, phase, **options)
+    bound = cramer_rao(sensor, phase, **options)
     unknown = cramer_rao(sensor, phase, amplitude_known=False, **options)
     np.testing.assert_allclose(small.gather(unknown), expected, rtol=1e-8)
-    assert np.all(small.gather(unknown) > small.gather(known))  # more unknowns, less information
+    assert np.all(small.gather(unknown) > small.gather(bound))  # more unknowns, less information
 
 
 @pytest.mark.parametrize("masks", [THREE[:1], THREE[:2], MIXED])
@@ -83,26 +83,6 @@ def test_bound_of_modes_is_that_of_a_dense_matrix(small, masks):
     phase = np.random.default_rng(2).normal(0, 0.4, small.shape)
     expected, _ = dense_bound(sensor, phase, 50.0, modes=modes)
     np.testing.assert_allclose(cramer_rao(sensor, phase, photons=50.0, modes=modes), expected, rtol=1e-8)
-
-
-def test_ideal_bound_of_a_flat_wavefront(small):
-    """A point of field 1 and a reference wave b of two dimples of +-pi/2 has 8 b^2 / (1 - 2 b + 2 b^2) photons."""
-    sensor = ZernikeSensor(small, *THREE[:2])
-    wave = np.abs(sensor.reference_wave(np.where(small.inside, 1 + 0j, 0))[0]) / np.sqrt(2)
-    local = 8 * wave**2 / (1 - 2 * wave + 2 * wave**2)
-    bound = cramer_rao(sensor, np.zeros(small.shape), photons=1e4) * 100
-    ratio = small.gather(bound * np.sqrt(local))
-    # The wave depends on all points: that adds the error of its own measurement, which is shared by all of them.
-    assert np.all(ratio > 0.98)
-    assert ratio.mean() < 1.02
-
-
-def test_bound_falls_as_the_root_of_the_photons(small):
-    sensor, phase = ZernikeSensor(small, *MIXED), np.random.default_rng(3).normal(0, 0.4, small.shape)
-    few, many = (small.gather(cramer_rao(sensor, phase, photons=photons)) for photons in (10.0, 1000.0))
-    np.testing.assert_allclose(few, 10 * many, rtol=1e-9)
-    noisy = small.gather(cramer_rao(sensor, phase, photons=10.0, read_noise=3.0))
-    assert np.all(noisy > few)
 
 
 def test_bound_does_not_depend_on_the_piston_or_the_batch(small):
@@ -116,19 +96,3 @@ def test_bound_does_not_depend_on_the_piston_or_the_batch(small):
         np.testing.assert_allclose(together[where], alone, rtol=1e-9)
     modes = zernike_basis(small, 5)
     assert cramer_rao(sensor, phases, photons=10.0, modes=modes).shape == (2, 3, 5)
-
-
-def test_a_mode_that_no_frame_shows_has_a_large_bound(small):
-    sensor = ZernikeSensor(small, *THREE[:2])
-    modes = np.concatenate([np.ones((1, *small.shape)), zernike_basis(small, 4)])
-    bound = cramer_rao(sensor, np.zeros(small.shape), photons=100.0, modes=modes)
-    assert bound[0] > 1e4 * bound[1:].max()  # piston
-    near, far = (
-        cramer_rao(
-            ZernikeSensor(small, *(Dimple(d, a) for a in (1.5, -1.5))), np.zeros(small.shape), photons=100.0
-        )
-        for d in (2.44, 2.0)
-    )
-    assert np.nanmax(near) > 10 * np.nanmax(far)  # tilt at the dark ring
-    blind = ZernikeSensor(small, Dimple(1.06, np.pi), Dimple(1.06, -np.pi))  # to first order in a flat phase
-    assert np.nanmin(cramer_rao(blind, np.zeros(small.shape), photons=100.0)) > 1e4 * np.nanmax(far)

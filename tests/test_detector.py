@@ -36,11 +36,6 @@ def test_background_has_photon_noise_and_adds_to_read_noise(pupil, flat):
     assert dark.min() < 0  # read noise is not cut off
 
 
-def test_noise_of_neighbouring_pixels_is_independent(pupil, flat):
-    counts = Detector(1.0, background=50).expose(0 * flat, seed=4)
-    assert abs(np.corrcoef(counts[..., :-1].ravel(), counts[..., 1:].ravel())[0, 1]) < 0.01
-
-
 def test_normalise_undoes_expose(pupil):
     frames = np.random.default_rng(0).uniform(0, 4, (2, 3, *pupil.shape))
     detector = Detector(1e12, background=1e11)
@@ -55,9 +50,3 @@ def test_seed_decides_the_noise(pupil, flat):
     np.testing.assert_array_equal(first, detector.expose(flat[:2], seed=np.random.default_rng(3)))
     assert np.any(first != detector.expose(flat[:2], seed=4))
     np.testing.assert_array_equal(state, np.random.get_state()[1])
-
-
-def test_a_single_pixel_may_be_exposed():
-    counts = Detector(1e6).expose(1.0, seed=1)
-    assert counts.shape == ()
-    assert counts == Detector(1e6).expose([1.0], seed=1)[0]

@@ -48,8 +48,8 @@ def jax():
         library.config.update(name, value)
 
 
-def agrees(found, expected, atol=1e-12):
-    np.testing.assert_allclose(np.asarray(found), expected, rtol=0, atol=atol)
+def agrees(result, expected, atol=1e-12):
+    np.testing.assert_allclose(np.asarray(result), expected, rtol=0, atol=atol)
 
 
 def test_frames_and_gradients_in_jax(jax, sensor, problem):
@@ -72,19 +72,19 @@ def test_frames_and_gradients_in_jax(jax, sensor, problem):
             (sensor.jacobian(problem[0], change), jax.jvp(measure, (phase,), (change,))[1]),
         )
 
-    for expected, found in compositions(phase, weights):
-        agrees(found, expected, 1e-11)
+    for expected, result in compositions(phase, weights):
+        agrees(result, expected, 1e-11)
     agrees(jax.grad(loss)(phase[0], weights[0]), gradient[0])
 
 
 def test_second_derivatives_in_jax(jax, sensor, problem):
     phase, weights, _ = problem
     measure, step = sensor.measure, 1e-4
-    phase, change = (np.where(sensor.pupil.inside, one, 0) for one in phase[:2])
+    phase, change = (np.where(sensor.pupil.inside, values, 0) for values in phase[:2])
     gradient = jax.grad(lambda phase: (measure(phase) * weights[0]).sum())
-    _, found = jax.jvp(gradient, (phase,), (change,))
+    _, curvature = jax.jvp(gradient, (phase,), (change,))
     ahead, behind = (sensor.jacobian_adjoint(phase + s * change, weights[0]) for s in (step, -step))
-    agrees(found, (ahead - behind) / (2 * step), 1e-5)
+    agrees(curvature, (ahead - behind) / (2 * step), 1e-5)
 
 
 def test_amplitudes_in_jax(jax, sensor, problem):
@@ -94,9 +94,9 @@ def test_amplitudes_in_jax(jax, sensor, problem):
     agrees(jax.jit(measure)(phase, amplitude), sensor.measure(phase, amplitude))
     agrees(jax.jit(measure)(phase, amplitude + ~sensor.pupil.inside), sensor.measure(phase, amplitude))
     agrees(measure(phase[0], jax.numpy.asarray(amplitude)), sensor.measure(phase[0], amplitude))
-    found = jax.jit(jax.grad(lambda amplitude: (measure(phase, amplitude) * weights).sum()))(amplitude)
+    gradient = jax.jit(jax.grad(lambda amplitude: (measure(phase, amplitude) * weights).sum()))(amplitude)
     ahead, behind = ((sensor.measure(phase, (1 + s) * amplitude) * weights).sum() for s in (step, -step))
-    assert (np.asarray(found) * amplitude).sum() == pytest.approx((ahead - behind) / (2 * step), rel=1e-6)
+    assert (np.asarray(gradient) * amplitude).sum() == pytest.approx((ahead - behind) / (2 * step), rel=1e-6)
 
 
 def test_a_sensor_keeps_nothing_of_a_trace(jax, sensor, problem):
@@ -108,9 +108,9 @@ def test_a_sensor_keeps_nothing_of_a_trace(jax, sensor, problem):
 
 def test_single_precision_in_jax(jax, sensor, problem):
     phase = problem[0].astype(np.float32)
-    found = jax.jit(sensor.measure)(phase)
-    assert found.dtype == np.float32
-    agrees(found, sensor.measure(phase.astype(float)), 1e-5)
+    frames = jax.jit(sensor.measure)(phase)
+    assert frames.dtype == np.float32
+    agrees(frames, sensor.measure(phase.astype(float)), 1e-5)
     jax.config.update("jax_enable_x64", False)
     with pytest.warns(UserWarning, match="jax_enable_x64 is off, so JAX computes frames in float32") as warned:
         assert sensor.measure(jax.numpy.asarray(phase)).dtype == np.float32
@@ -155,12 +155,14 @@ def test_gradients_in_torch(torch, sensor, problem):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         (sensor.measure(variable, amplitude) * weights).sum().backward()
-        (found,) = torch.autograd.grad((sensor.measure(variable) * weights).sum(), variable)
-        transformed = torch.vmap(torch.func.grad(lambda *one: (sensor.measure(one[0]) * one[1]).sum()))
+        (batch,) = torch.autograd.grad((sensor.measure(variable) * weights).sum(), variable)
+        transformed = torch.vmap(
+            torch.func.grad(lambda *arguments: (sensor.measure(arguments[0]) * arguments[1]).sum())
+        )
         together = transformed(torch.tensor(phase), weights)
         sensor.jacobian_adjoint(variable, weights.requires_grad_()).sum().backward()
-    for one in (found, together):
-        agrees(one, gradient)
+    for result in (batch, together):
+        agrees(result, gradient)
     agrees(torch.autograd.grad((sensor.measure(variable) * weights).sum(), variable)[0], gradient)
     light = (sensor.measure(phase) * weights.detach().numpy()).sum()
     assert float((amplitude.grad * amplitude.detach()).sum()) == pytest.approx(

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
-from zwfs import Dimple, Patch, Pupil, ZernikeSensor, strehl
+from zwfs import Dimple, Patch, Pupil, ZernikeSensor
 from zwfs.masks import focal_field
 
 
@@ -35,29 +35,12 @@ def test_a_function_that_works_in_place_moves_no_node():
     np.testing.assert_array_equal(u, [0.1, 0.2])
 
 
-def test_coordinates_broadcast():
-    for mask in (Dimple(1, 1), Patch(1, lambda u, v: 1j)):
-        assert mask.transmission(np.zeros((1, 3)), np.zeros((2, 1))).shape == (2, 3)
-        with pytest.raises(ValueError, match=r"u and v have shapes \(2,\) and \(3,\)"):
-            mask.transmission(np.zeros(2), np.zeros(3))
-
-
-def test_breaks_are_sorted():
-    assert Patch(3, lambda u, v: 1, breaks=[2, 1]).breaks == (1, 2)
-
-
 def test_flat_wavefront_makes_the_airy_pattern():
     pupil = Pupil.circular(400)
     u = np.linspace(0.05, 4, 60)
     field = focal_field(pupil, pupil.amplitude, u, [0.0])[0]
     np.testing.assert_allclose(field, 2 * j1(np.pi * u) / (np.pi * u), atol=2e-3)
     assert focal_field(pupil, pupil.amplitude, [0.0], [0.0])[0, 0] == pytest.approx(1)
-
-
-def test_strehl_is_the_intensity_on_the_axis(pupil, screens):
-    screen = screens(0.7, 1)[0]
-    field = focal_field(pupil, np.exp(1j * screen), [0.0], [0.0])
-    assert np.abs(field[0, 0]) ** 2 == pytest.approx(strehl(pupil, screen), rel=1e-12)
 
 
 def test_integral_over_the_dimple_is_the_reference_wave_on_the_axis():

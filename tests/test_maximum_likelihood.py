@@ -46,12 +46,12 @@ def test_all_screens_come_back_and_are_known_to_be_right(pupil, screens, diamete
 def test_a_large_range_needs_several_starts(pupil, screens):
     sensor, truth = pair(pupil, 2.0, 0.5, -0.5), screens(2.0, 12, seed=3)
     frames = sensor.measure(truth)
-    one, many = (MaximumLikelihood(sensor, n_starts=n)(frames) for n in (1, 8))
+    single, many = (MaximumLikelihood(sensor, n_starts=n)(frames) for n in (1, 8))
     right = reconstruction_error(pupil, many.phase, truth) < 0.05 * 2.0
-    assert one.consistent.sum() < many.consistent.sum()
+    assert single.consistent.sum() < many.consistent.sum()
     assert right.sum() >= 10
     np.testing.assert_array_equal(right, many.consistent)  # a wrong solution is not called consistent
-    np.testing.assert_array_equal(many.n_starts == 1, one.consistent)
+    np.testing.assert_array_equal(many.n_starts == 1, single.consistent)
     assert many.n_starts.max() <= 8
 
 
@@ -85,7 +85,7 @@ def test_negative_pixels_bias_nothing(pupil, modes):
     frames = camera.normalise(camera.expose(frames, 1))
     method = MaximumLikelihood(sensor, basis, photons=photons, read_noise=read_noise, n_starts=1)
     result, clipped = method(frames), method(np.maximum(frames, 0))
-    gain, clipped_gain = (np.sum(one.coefficients * true) / np.sum(true**2) for one in (result, clipped))
+    gain, clipped_gain = (np.sum(estimate.coefficients * true) / np.sum(true**2) for estimate in (result, clipped))
     assert gain == pytest.approx(1, abs=0.02)
     within = np.mean(np.abs(result.coefficients - true) < result.sigma_coefficients)
     assert within == pytest.approx(0.683, abs=0.03)
@@ -93,17 +93,6 @@ def test_negative_pixels_bias_nothing(pupil, modes):
     assert result.consistent.all()
     assert clipped_gain < 0.97
     assert np.mean(clipped.chi2) < 0.9
-
-
-def test_pixels_that_no_read_noise_explains_do_not_decide_the_phase(pupil, screens):
-    sensor, truth = pair(pupil, 2.0, 0.5, -0.5), screens(0.5, 3)
-    frames = sensor.measure(truth)
-    frames[..., 10:30:4, 10:30:4] = -1.0
-    for noise in ({"photons": 100}, {"photons": 100, "read_noise": 0.1}):
-        result = MaximumLikelihood(sensor, **noise, n_starts=1)(frames)
-        error = wrapped_residual(pupil, result.phase, truth)
-        assert np.nanmedian(np.abs(error)) < 0.1
-        assert not result.consistent.any()
 
 
 def test_a_solution_that_has_not_converged_is_not_called_consistent(pupil, screens):
@@ -182,7 +171,7 @@ def test_modes_are_at_least_as_good_as_points(rms, photons):
     if photons is not None:
         camera = Detector(photons)
         frames = camera.normalise(camera.expose(frames, 8))
-    points, fitted = (MaximumLikelihood(sensor, some, photons=photons) for some in (None, basis))
+    points, fitted = (MaximumLikelihood(sensor, unknowns, photons=photons) for unknowns in (None, basis))
     result = fitted(frames)
     error = reconstruction_error(pupil, result.phase, truth)
     assert result.consistent.all()
@@ -221,7 +210,7 @@ def test_a_prior_helps_faint_frames_and_does_not_bias_bright_ones(pupil):
             MaximumLikelihood(sensor, basis, photons=photons, prior=covariance, n_starts=1)(noisy)
             for covariance in (None, np.diag(variance))
         )
-        errors = [np.sqrt(np.mean((one.coefficients - true) ** 2)) for one in (plain, prior)]
+        errors = [np.sqrt(np.mean((estimate.coefficients - true) ** 2)) for estimate in (plain, prior)]
         assert errors[1] < gain * errors[0]
         assert np.std((prior.coefficients - true) / prior.sigma_coefficients) == pytest.approx(1, abs=0.1)
 
@@ -251,15 +240,6 @@ def test_phase_and_amplitude_together(pupil, screens):
     assert np.nanmean(noisy.sigma[0]) == pytest.approx(np.nanmean(expected), rel=0.03)
 
 
-def test_a_frame_of_one_mask_has_many_explanations(pupil, screens):
-    sensor, truth = ZernikeSensor(pupil, Dimple(1.06, PI / 2)), screens(0.3, 2)
-    result = MaximumLikelihood(sensor)(sensor.measure(truth))
-    # A point whose intensity is extreme shows its phase to second order only.
-    assert reconstruction_error(pupil, result.phase, truth).max() < 0.1 * 0.3
-    far = MaximumLikelihood(sensor, n_starts=1)(sensor.measure(screens(1.5, 2)), screens(1.5, 2, seed=4))
-    assert np.all(far.residual < 0.3)
-
-
 @pytest.mark.parametrize(
     "masks",
     [
@@ -274,12 +254,3 @@ def test_any_masks_and_any_detector(pupil, screens, masks, extent):
     result = MaximumLikelihood(sensor)(sensor.measure(truth))
     assert result.consistent.all()
     assert reconstruction_error(pupil, result.phase, truth).max() < 1e-5
-
-
-def test_masks_that_no_iteration_takes(pupil, screens):
-    """The same mask twice and the pair (0, pi) have a determinant of 0: they hold as much as one mask."""
-    truth = screens(0.2, 2)
-    for shifts in ((0.5, 0.5), (0.5, 0.0)):
-        sensor = pair(pupil, 1.06, *shifts)
-        result = MaximumLikelihood(sensor)(sensor.measure(truth))
-        assert reconstruction_error(pupil, result.phase, truth).max() < 1e-4

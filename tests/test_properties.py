@@ -1,14 +1,13 @@
 """Claims that hold for any pupil, mask, batch and precision."""
 
 import numpy as np
-from hypothesis import assume, given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from zwfs import (
     Dimple,
     GerchbergSaxton,
     GradientDescent,
-    Linear,
     Patch,
     PhaseShifted,
     Pupil,
@@ -81,27 +80,6 @@ def test_a_passive_mask_never_adds_light(sensor, batch, seed):
     assert np.all(flux <= incoming[..., np.newaxis] * (1 + 1e-12))
 
 
-# The wave of a dimple is 1 / diameter wide: smaller ones would need a wider detector.
-@given(pupils(), st.builds(Dimple, st.floats(1, 2), st.floats(-3, 3)), seeds)
-@settings(max_examples=4)  # a wide detector takes long
-def test_a_phase_mask_loses_no_light_on_a_wide_detector(pupil, dimple, seed):
-    field = white(pupil.shape, seed) * pupil.inside
-    sensor = ZernikeSensor(pupil, dimple, extent=4.0, tolerance=1e-6)
-    lost = 1 - np.sum(np.abs(sensor.propagate(field)) ** 2) / np.sum(np.abs(field) ** 2)
-    # What is scattered, |psi_ref|^2, falls with the cube of the distance.
-    scattered = np.sum(np.abs(sensor.reference_wave(field)) ** 2) / np.sum(np.abs(field) ** 2)
-    assert -1e-5 < lost < 0.3 * scattered + 1e-5
-
-
-@given(sensors(), batches, seeds)
-def test_batch_equals_loop(sensor, batch, seed):
-    phase = smooth(sensor.pupil, 0.5, batch, seed)
-    frames = sensor.measure(phase)
-    assert frames.shape == (*batch, sensor.n_masks, *sensor.detector_shape)
-    for where in np.ndindex(*batch):
-        np.testing.assert_allclose(frames[where], sensor.measure(phase[where]), atol=1e-12)
-
-
 @given(sensors(), seeds)
 def test_gradient(sensor, seed):
     pupil = sensor.pupil
@@ -119,26 +97,15 @@ def test_gradient(sensor, seed):
 def test_phase_shifted_inverts_small_phases(pupil, masks, batch, seed):
     sensor = ZernikeSensor(pupil, *masks)
     phase = smooth(pupil, 0.01, batch, seed)
-    found = PhaseShifted(sensor, n_iterations=50, tolerance=1e-9)(sensor.measure(phase))
-    assert found.phase.shape == phase.shape
-    assert np.all(reconstruction_error(pupil, found.phase, phase) < 1e-6)
-
-
-@given(pupils(), useful_pairs(), seeds)
-def test_linear_and_descent_invert_small_phases(pupil, masks, seed):
-    sensor = ZernikeSensor(pupil, *masks)
-    modes = zernike_basis(pupil, 12)
-    phase = smooth(pupil, 1e-3, (), seed)
-    frames = sensor.measure(phase)
-    # What is left is of second order in the phase; near a shift of pi it outweighs the first at a few hundredths.
-    for method in (Linear(sensor, modes), GradientDescent(sensor, modes, n_iterations=100)):
-        assert reconstruction_error(pupil, method(frames).phase, phase) < 0.03 * 1e-3
+    result = PhaseShifted(sensor, n_iterations=50, tolerance=1e-9)(sensor.measure(phase))
+    assert result.phase.shape == phase.shape
+    assert np.all(reconstruction_error(pupil, result.phase, phase) < 1e-6)
 
 
 @given(sensors(), seeds, st.floats(0.1, 3))
 def test_gerchberg_saxton_with_the_modelled_field_never_moves_away_from_the_frames(sensor, seed, rms):
     amplitude = np.sqrt(sensor.measure(smooth(sensor.pupil, rms, (), seed)))
-    kept = GerchbergSaxton(sensor, n_iterations=8, tolerance=0, unmeasured="model")
-    history = kept(amplitude**2, history=True).history
+    method = GerchbergSaxton(sensor, n_iterations=8, tolerance=0, unmeasured="model")
+    history = method(amplitude**2, history=True).history
     mismatch = np.sum((amplitude - np.sqrt(sensor.measure(history))) ** 2, axis=(-3, -2, -1))
     assert np.all(np.diff(mismatch) <= 1e-9 * mismatch[0])

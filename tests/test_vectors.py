@@ -34,27 +34,27 @@ def test_files_are_those_of_the_cases_and_small():
 
 
 def test_npz_is_what_the_script_makes(case):
-    kept = npz(case)
+    stored = npz(case)
     for name, values in case.arrays().items():
         if name in ("frames", "field"):
-            np.testing.assert_allclose(kept[name], values, rtol=0, atol=1e-13)
+            np.testing.assert_allclose(stored[name], values, rtol=0, atol=1e-13)
         elif name == "amplitude":
-            np.testing.assert_allclose(kept[name], values, rtol=1e-15)
+            np.testing.assert_allclose(stored[name], values, rtol=1e-15)
         else:
-            np.testing.assert_array_equal(kept[name], values)
+            np.testing.assert_array_equal(stored[name], values)
 
 
 def test_fits_holds_the_same(case):
-    kept = npz(case)
+    stored = npz(case)
     with fits.open(make.FOLDER / f"{case.name}.fits") as file:
         file.verify("exception")
         header = file[0].header
-        np.testing.assert_array_equal(file[0].data, kept["frames"])
-        np.testing.assert_array_equal(file["PHASE"].data, kept["phase"])
-        np.testing.assert_array_equal(file["AMPLITUDE"].data, kept["amplitude"])
-        np.testing.assert_array_equal(file["FIELD_RE"].data + 1j * file["FIELD_IM"].data, kept["field"])
-    assert header["NPIXELS"] == kept["n_pixels"]
-    for k, mask in enumerate(kept["masks"], start=1):
+        np.testing.assert_array_equal(file[0].data, stored["frames"])
+        np.testing.assert_array_equal(file["PHASE"].data, stored["phase"])
+        np.testing.assert_array_equal(file["AMPLITUDE"].data, stored["amplitude"])
+        np.testing.assert_array_equal(file["FIELD_RE"].data + 1j * file["FIELD_IM"].data, stored["field"])
+    assert header["NPIXELS"] == stored["n_pixels"]
+    for k, mask in enumerate(stored["masks"], start=1):
         assert tuple(header[f"{name}{k}"] for name in ("DIAM", "PHASE", "AMPL", "TILT")) == tuple(mask)
 
 

@@ -92,7 +92,7 @@ def cases():
     offset = Pupil(np.pad(disc.amplitude, dark), 32, np.pad(disc.segments, dark), (15.5, 20.5))
     shifts = tuple(Mask(1.06, theta) for theta in (0.3, 0.3 + 2 * np.pi / 3, 0.3 - 2 * np.pi / 3))
     wide, widest, dim, wedge = Mask(2.0), Mask(4.0, 0.7), Mask(amplitude=0.7), Mask(tilt=1.0)
-    known = [
+    simple = [
         Case("circular_flat", "flat wavefront", disc, flat(disc), plus),
         Case("circular_tilt", "tilt of 0.3 lambda/D along +x", disc, tilt(disc, 0.3), pair),
     ]
@@ -116,11 +116,11 @@ def cases():
         ("uneven_pair", "33 pixels, uneven amplitude, 0.8 rad rms, two masks", uneven, 0.8, pair),
         ("oblong_pair", "35 by 37 pixels, D off their centre, 0.8 rad rms", offset, 0.8, pair),
     ]
-    made = []
+    random = []
     for seed, (name, text, pupil, rms, masks, *margin) in enumerate(screens, start=1):
         phase = (pistons if pupil is hexagons else screen)(pupil, rms, seed)
-        made.append(Case(name, text, pupil, phase, masks, *margin))
-    return known + made
+        random.append(Case(name, text, pupil, phase, masks, *margin))
+    return simple + random
 
 
 def rounded(pupil, phase):

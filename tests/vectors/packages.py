@@ -119,10 +119,10 @@ PACKAGES = {
 
 def error(name, case):
     """Largest difference of a frame from the vector, None where the package has no such mask."""
-    with np.load(FOLDER / f"{case.name}.npz") as kept, warnings.catch_warnings():
+    with np.load(FOLDER / f"{case.name}.npz") as stored, warnings.catch_warnings():
         warnings.simplefilter("ignore")
         frames = PACKAGES[name](case)
-        return None if frames is None else float(np.abs(frames - kept["frames"]).max())
+        return None if frames is None else float(np.abs(frames - stored["frames"]).max())
 
 
 def main():

@@ -39,13 +39,6 @@ def test_curves_have_the_names_of_their_labels_and_share_their_places():
     }
 
 
-def test_a_panel_without_labels_has_all_its_curves():
-    figure, axes = plt.subplots()
-    axes.plot(THREE, THREE)
-    axes.set(xlabel="x", ylabel="y")
-    assert columns_of(figure) == {"x": THREE.tolist(), "y": THREE.tolist()}
-
-
 def test_panels_have_the_labels_that_they_share():
     figure, panels = plt.subplots(1, 2, sharey=True)
     for axes, title in zip(panels, ("left", "right"), strict=True):
@@ -99,16 +92,23 @@ def test_a_mesh_has_the_middles_of_its_cells():
     assert columns_of(figure) == expected
 
 
+def test_an_element_that_is_not_read_is_named(tmp_path):
+    file = tmp_path / "layout.svg"
+    file.write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 90 90"><path d="M0,0"/></svg>')
+    with pytest.raises(ValueError, match="<path> in a drawing: expected one of the simple elements"):
+        draw_layout(str(file), str(file), {})
+
+
+def test_a_panel_without_labels_has_all_its_curves():
+    figure, axes = plt.subplots()
+    axes.plot(THREE, THREE)
+    axes.set(xlabel="x", ylabel="y")
+    assert columns_of(figure) == {"x": THREE.tolist(), "y": THREE.tolist()}
+
+
 def test_second_axes_have_columns():
     figure, axes = plt.subplots()
     axes.semilogx(THREE, THREE)
     axes.set(xlabel="input", ylabel="error")
     axes.secondary_xaxis("top", functions=(lambda x: x**2, np.sqrt)).set_xlabel("$D/r_0$")
     np.testing.assert_allclose(drawn_columns(figure)["D/r_0"], THREE**2)
-
-
-def test_an_element_that_is_not_read_is_named(tmp_path):
-    file = tmp_path / "layout.svg"
-    file.write_text('<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 90 90"><path d="M0,0"/></svg>')
-    with pytest.raises(ValueError, match="<path> in a drawing: expected one of the simple elements"):
-        draw_layout(str(file), str(file), {})

@@ -10,40 +10,9 @@ from joblib import parallel_config
 
 from studies.kit.experiments import linearity_curves
 from studies.kit.methods import own_reconstructors, paper_reconstructors
-from studies.kit.setups import screens_at
-from zwfs import RECONSTRUCTORS, Arcsine, Linear, PhaseShifted, reconstruction_error
+from zwfs import RECONSTRUCTORS, Arcsine
 
 ROOT = Path(__file__).parent.parent
-RMS = (0.05, 0.3, 0.6)
-
-
-@pytest.fixture(scope="module")
-def methods(classic, shifted, modes):
-    return {"linear": Linear(classic, modes), "shifted": PhaseShifted(shifted)}
-
-
-@pytest.fixture(scope="module")
-def curves(methods, modes):
-    return linearity_curves(methods, modes, RMS, 4, seed=7)
-
-
-def test_errors_are_those_of_each_screen(curves, methods, modes, pupil, classic):
-    screens = screens_at(modes, 0.3, 4, seed=7, task=1)
-    np.testing.assert_allclose(pupil.rms(screens), 0.3)
-    found = methods["linear"](classic.measure(screens))
-    np.testing.assert_allclose(curves.errors["linear"][1], reconstruction_error(pupil, found.phase, screens))
-    assert curves.converged["shifted"].shape == (3, 4)
-    np.testing.assert_allclose(curves.mean("linear"), curves.errors["linear"].mean(axis=1))
-    np.testing.assert_allclose(curves.std("linear"), curves.errors["linear"].std(axis=1))
-
-
-def test_a_point_depends_on_the_seed_and_its_place_only(curves, methods, modes):
-    alone = linearity_curves({"linear": methods["linear"]}, modes, RMS[:2], 4, seed=7)
-    np.testing.assert_allclose(alone.errors["linear"], curves.errors["linear"][:2], rtol=1e-9)
-    other = linearity_curves({"linear": methods["linear"]}, modes, RMS[:2], 4, seed=8)
-    assert not np.allclose(alone.errors["linear"], other.errors["linear"])
-
-
 OWN = """
 import numpy as np
 from types import SimpleNamespace
@@ -127,5 +96,5 @@ def test_the_reconstructor_on_the_page_stands_next_to_the_five(tmp_path):
     studies = os.environ | {"PYTHONPATH": str(ROOT / "notebooks")}  # where a reader keeps the file
     printed = subprocess.run(run, cwd=tmp_path, env=studies, capture_output=True, text=True, check=True).stdout
     assert printed in page
-    errors = {name: [float(one) for one in values] for name, *values in map(str.split, printed.splitlines())}
+    errors = {name: [float(value) for value in values] for name, *values in map(str.split, printed.splitlines())}
     assert errors["PhaseShifted"][1] < 0.001 < errors["FlatReference"][1] < errors["Linear"][1]

@@ -8,7 +8,6 @@ import matplotlib
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from pypdf import PdfReader
 
 from studies.kit.results import FOLDER, csv_bytes, glue_numbers, publish, rounded, screen_columns, stacked
 
@@ -48,8 +47,8 @@ def test_nothing_is_written_without_a_folder_and_the_figure_looks_the_same(figur
     publish(twin, "plot")
     assert os.listdir() == ["files"]
     shown = [io.BytesIO(), io.BytesIO()]
-    for stream, one in zip(shown, (figure, twin), strict=True):
-        one.savefig(stream, format="png", bbox_inches="tight", metadata={"Software": None})
+    for stream, drawing in zip(shown, (figure, twin), strict=True):
+        drawing.savefig(stream, format="png", bbox_inches="tight", metadata={"Software": None})
     assert shown[0].getvalue() == shown[1].getvalue()
 
 
@@ -67,23 +66,14 @@ def test_files_are_the_same_from_run_to_run(figure, tmp_path, monkeypatch):
     assert plt.imread(tmp_path / "first" / "plot.png").shape[:2] == (600, 800)  # 200 dots per inch
 
 
-def test_letters_of_a_pdf_are_truetype_as_journals_ask(plain, tmp_path, monkeypatch):
-    plain.text(0, 0, r"$\lambda/D$ and words")
-    published(tmp_path / "files", monkeypatch, plain)
-    resources = PdfReader(tmp_path / "files" / "plot.pdf").pages[0]["/Resources"]
-    kinds = {kind.get_object()["/Subtype"] for kind in resources["/Font"].values()}
-    assert kinds
-    assert "/Type3" not in kinds
-
-
 def test_single_screens_are_written_with_a_row_each(plain, tmp_path, monkeypatch):
     errors = np.arange(12.0).reshape(2, 2, 3)
     tables = {
         n: screen_columns({"input": [0.1, 0.2], "photons": [1, 10]}, {"error": factor * errors})
         for n, factor in (("a", 1), ("b", 2))
     }
-    made = published(tmp_path / "files", monkeypatch, plain, screens=stacked("case", tables))
-    header, *rows = csv.reader(made["plot_screens.csv"].decode().splitlines())
+    files = published(tmp_path / "files", monkeypatch, plain, screens=stacked("case", tables))
+    header, *rows = csv.reader(files["plot_screens.csv"].decode().splitlines())
     assert header == ["case", "input", "photons", "screen", "error"]
     assert len(rows) == 24
     for case, rms, photons, screen, error in rows:
@@ -105,13 +95,19 @@ def test_a_file_is_replaced_and_not_written_through_a_link(plain, tmp_path, monk
     assert sorted(file.name for file in folder.iterdir()) == names
 
 
-def test_figure_without_layout_keeps_its_place(tmp_path, monkeypatch, recwarn):
-    with plt.rc_context({"figure.constrained_layout.use": True}):
-        figure = plt.figure(layout="none")
-        axes = figure.add_axes((0.1, 0.2, 0.3, 0.4))
-        published(tmp_path / "files", monkeypatch, figure)
-    assert axes.get_position().bounds == pytest.approx((0.1, 0.2, 0.3, 0.4))
-    assert not recwarn.list
+def test_rounded_numbers_are_glued_as_they_are_and_strings_stay(monkeypatch):
+    glued = {}
+    monkeypatch.setattr("myst_nb.glue", lambda name, value, display: glued.update({name: value}))
+    numbers = rounded({"small": 1.2345e-7, "ratio": 3210.123, "flag": True}, ".3g")
+    glue_numbers(numbers | rounded({"error": np.float64(0.123456), "limit": np.inf, "where": "never"}))
+    expected = {"small": 1.23e-7, "ratio": 3210, "flag": 1.0, "error": 0.1235, "limit": np.inf, "where": "never"}
+    assert glued == expected
+
+
+@pytest.mark.parametrize("name", ["Plot", "../plot"])
+def test_bad_names_are_refused(plain, name):
+    with pytest.raises(ValueError, match=f"name = '{name}'"):
+        publish(plain, name)
 
 
 def test_columns_are_written_in_order_with_nine_digits():
@@ -122,18 +118,3 @@ def test_columns_are_written_in_order_with_nine_digits():
         ["3.14159265", "1", "1.06", "linear", "0.5"],
         ["nan", "2", "", "", "1e-30"],
     ]
-
-
-@pytest.mark.parametrize("name", ["Plot", "../plot"])
-def test_bad_names_are_refused(plain, name):
-    with pytest.raises(ValueError, match=f"name = '{name}'"):
-        publish(plain, name)
-
-
-def test_rounded_numbers_are_glued_as_they_are_and_strings_stay(monkeypatch):
-    glued = {}
-    monkeypatch.setattr("myst_nb.glue", lambda name, value, display: glued.update({name: value}))
-    numbers = rounded({"small": 1.2345e-7, "ratio": 3210.123, "flag": True}, ".3g")
-    glue_numbers(numbers | rounded({"error": np.float64(0.123456), "limit": np.inf, "where": "never"}))
-    expected = {"small": 1.23e-7, "ratio": 3210, "flag": 1.0, "error": 0.1235, "limit": np.inf, "where": "never"}
-    assert glued == expected

@@ -66,11 +66,11 @@ def test_screens_are_independent_of_each_other(pupil, kolmogorov):
 
 
 def test_screens_scale_with_r0_and_the_seed_decides(pupil):
-    one, half = (turbulent_screens(pupil, r0, 3, 5.0, seed=4) for r0 in (1.0, 0.5))
-    np.testing.assert_allclose(half, one * 2 ** (5 / 6), atol=1e-12)
-    np.testing.assert_array_equal(one[:1], turbulent_screens(pupil, 1.0, 1, 5.0, seed=4))
-    assert not one[:, ~pupil.inside].any()
-    np.testing.assert_allclose(pupil.gather(one).mean(axis=-1), 0, atol=1e-12)
+    whole, half = (turbulent_screens(pupil, r0, 3, 5.0, seed=4) for r0 in (1.0, 0.5))
+    np.testing.assert_allclose(half, whole * 2 ** (5 / 6), atol=1e-12)
+    np.testing.assert_array_equal(whole[:1], turbulent_screens(pupil, 1.0, 1, 5.0, seed=4))
+    assert not whole[:, ~pupil.inside].any()
+    np.testing.assert_allclose(pupil.gather(whole).mean(axis=-1), 0, atol=1e-12)
 
 
 def test_moving_screens_have_the_rms_asked_for_at_the_start_and_no_piston():

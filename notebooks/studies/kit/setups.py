@@ -76,11 +76,11 @@ def make_pupil(n_pixels: int, kind: str = "circular", **changes: Any) -> Pupil:
 def _pupil_of_file(n_pixels: int, file: str = "") -> Pupil:
     from zwfs.frames.files import read  # late: few notebooks need it, and it imports all of zwfs.frames
 
-    found = read(file, max_images=1)
-    (image,) = found.images
+    recording = read(file, max_images=1)
+    (image,) = recording.images
     if max(image.shape) != n_pixels:
-        raise ValueError(f"{found.name} is {max(image.shape)} pixels wide: expected n_pixels = {n_pixels}")
-    with within(found.name, ()):
+        raise ValueError(f"{recording.name} is {max(image.shape)} pixels wide: expected n_pixels = {n_pixels}")
+    with within(recording.name, ()):
         return Pupil.from_amplitude(image)
 
 
@@ -131,7 +131,7 @@ class Screens:
     def inputs(self, rms: Sequence[float]) -> list[float]:
         """Return inputs of at most the largest one (radian rms), and with `d_over_r0` the largest itself."""
         largest = self.largest(max(rms))
-        return sorted({*(one for one in rms if one < largest), largest})
+        return sorted({*(value for value in rms if value < largest), largest})
 
     def mark(self, figure: Figure) -> Figure:
         """Add an axis of D/r0 to the panels of a figure against the input, if the screens have one."""
@@ -261,20 +261,20 @@ def _screens_of_file(pupil: Pupil, file: str) -> NDArray:
     """Return the screens of a file, each of which can be scaled to an rms."""
     from zwfs.frames.files import read
 
-    found = read(file, max_bytes=_MAX_BYTES, max_images=_MAX_BYTES)
-    if found.images.shape[1:] != pupil.shape:
+    recording = read(file, max_bytes=_MAX_BYTES, max_images=_MAX_BYTES)
+    if recording.images.shape[1:] != pupil.shape:
         raise ValueError(
-            f"{found.name} has shape {found.images.shape}: expected (n_screens, ny, nx) with {pupil.shape}"
+            f"{recording.name} has shape {recording.images.shape}: expected (n_screens, ny, nx) with {pupil.shape}"
         )
-    values = pupil.gather(found.images)
+    values = pupil.gather(recording.images)
     with np.errstate(invalid="ignore", over="ignore"):
         size, spread = np.abs(values).max(axis=-1), np.ptp(values, axis=-1)
     wrong = np.flatnonzero(~((size <= _LARGEST) & (spread >= 1 / _LARGEST)))  # NaN is wrong, too
     if wrong.size:
         raise ValueError(
-            f"{found.name}[{wrong[0]}] is flat, not finite or beyond {_LARGEST:g}: expected a wavefront"
+            f"{recording.name}[{wrong[0]}] is flat, not finite or beyond {_LARGEST:g}: expected a wavefront"
         )
-    return found.images
+    return recording.images
 
 
 def _require_screens(recorded: NDArray, n_screens: int) -> None:

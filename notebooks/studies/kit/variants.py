@@ -52,12 +52,12 @@ def has_narrow(figure: Figure) -> bool:
 def variants(figure: Figure) -> dict[str, Figure]:
     """Return copies of a figure: "dark", and for panels on a grid and some drawings "narrow" and "narrow-dark"."""
     state = pickle.dumps(figure)
-    made = {"dark": _darkened(_copy(state))}
+    copies = {"dark": _darkened(_copy(state))}
     if has_narrow(figure):
         drawn = _DRAWN.get(figure)
-        made["narrow"] = _copy(pickle.dumps(drawn)) if drawn else _stacked(_copy(state))
-        made["narrow-dark"] = _darkened(_copy(pickle.dumps(made["narrow"])))
-    return made
+        copies["narrow"] = _copy(pickle.dumps(drawn)) if drawn else _stacked(_copy(state))
+        copies["narrow-dark"] = _darkened(_copy(pickle.dumps(copies["narrow"])))
+    return copies
 
 
 def _copy(state: bytes) -> Figure:
@@ -137,7 +137,7 @@ def _rows(panels: list[Axes], *, by_columns: bool) -> list[list[Axes]]:
     rows: list[list[Axes]] = []
     for axes in sorted(panels, key=order):
         pair = [*rows[-1], axes] if rows else []
-        if len(pair) == 2 and len({order(one)[0] for one in pair}) == 1 and all(map(_fits_half, pair)):
+        if len(pair) == 2 and len({order(panel)[0] for panel in pair}) == 1 and all(map(_fits_half, pair)):
             rows[-1] = pair
         else:
             rows.append([axes])
@@ -200,14 +200,14 @@ def _turn(figure: Figure, axes: Axes) -> bool:
 def _label(axes: Axes, panels: list[Axes]) -> None:
     """Give a panel the labels and the title that it shares with others of its row and column."""
     spec: Any = axes.get_subplotspec()
-    for one in panels:
-        other: Any = one.get_subplotspec()
-        if other.rowspan == spec.rowspan and not axes.get_ylabel() and axes.get_yticks().size:
-            axes.set_ylabel(one.get_ylabel())
-        if other.colspan == spec.colspan and not axes.get_xlabel() and axes.get_xticks().size:
-            axes.set_xlabel(one.get_xlabel())
-        if other.colspan == spec.colspan and not axes.get_title():
-            axes.set_title(one.get_title(), fontsize=one.title.get_fontsize())
+    for panel in panels:
+        place: Any = panel.get_subplotspec()
+        if place.rowspan == spec.rowspan and not axes.get_ylabel() and axes.get_yticks().size:
+            axes.set_ylabel(panel.get_ylabel())
+        if place.colspan == spec.colspan and not axes.get_xlabel() and axes.get_xticks().size:
+            axes.set_xlabel(panel.get_xlabel())
+        if place.colspan == spec.colspan and not axes.get_title():
+            axes.set_title(panel.get_title(), fontsize=panel.title.get_fontsize())
     axes.tick_params(labelbottom=True, labelleft=True)
 
 
@@ -218,12 +218,12 @@ def _darkened(figure: Figure) -> Figure:
         image.set_cmap(DARK_PHASE_MAP)
         if image.colorbar:  # a copy does not follow its map
             image.colorbar.update_normal(image)
-    kept: set[Artist] = {figure, *figure.axes}  # their patches are found as well
+    marked: set[Artist] = {figure, *figure.axes}  # their patches are found as well
     for axes in {*figure.axes} - {image.axes for image in phases}:
         if axes.images or axes.findobj(QuadMesh):
             marks = (*axes.images, *axes.lines, *axes.collections, *axes.patches, *axes.texts)
-            kept.update(part for artist in marks for part in artist.findobj())
-    drawn = set(figure.findobj()) - kept
+            marked.update(part for artist in marks for part in artist.findobj())
+    drawn = set(figure.findobj()) - marked
     arrows = [text.arrow_patch for text in drawn if isinstance(text, Annotation) and text.arrow_patch]
     boxes = [text.get_bbox_patch() for text in drawn if isinstance(text, Text) and text.get_bbox_patch()]
     for artist in drawn.union(arrows, boxes):
@@ -231,7 +231,7 @@ def _darkened(figure: Figure) -> Figure:
             parts = [part for part in _PARTS if hasattr(artist, f"get_{part}") and hasattr(artist, f"set_{part}")]
             colors = {part: getattr(artist, f"get_{part}")() for part in parts}  # all, as one may follow another
             for part, color in colors.items():
-                dark = [dark_color(one) for one in to_rgba_array(color)]
+                dark = [dark_color(rgba) for rgba in to_rgba_array(color)]
                 getattr(artist, f"set_{part}")(dark if np.ndim(color) == 2 else dark[0] if dark else color)
     ink, grid = map(dark_color, ("#000000", "#dddddd"))
     for axes in figure.axes:

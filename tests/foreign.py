@@ -62,19 +62,19 @@ def recorded(seed=1, flux=1.0, **moved):
     return images[:2], images[2:]
 
 
-def phase_difference(found):
+def phase_difference(phases):
     """Measured phase less the true one, without piston, (ny, nx); NaN at pixels that are not fully lit."""
     phase, _, clear = fine_images()
-    registered = found.measurement.registered
+    registered = phases.measurement.registered
     window = tuple(slice(first, first + registered.n_pixels) for first in registered.corner)
     lit = (_blocks(clear).min(axis=(1, 3)) > 0.5)[window]
-    left = np.where(lit, np.exp(1j * (found.phase - on_camera(phase)[window])), np.nan)
-    return np.angle(left * np.conj(np.nanmean(left)))
+    residual = np.where(lit, np.exp(1j * (phases.phase - on_camera(phase)[window])), np.nan)
+    return np.angle(residual * np.conj(np.nanmean(residual)))
 
 
-def phase_error(found):
+def phase_error(phases):
     """Rms error of a measured phase at the camera pixels that are fully lit, radian."""
-    return np.nanstd(phase_difference(found))
+    return np.nanstd(phase_difference(phases))
 
 
 def _blocks(fine):

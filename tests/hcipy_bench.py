@@ -105,8 +105,8 @@ class HcipyBench:
 
         power = []
         for wave, distance in zip(waves, self.focus, strict=True):
-            seen = hcipy.FresnelPropagator(self._grid, distance).forward(wave) if distance else wave
-            power.append(np.abs(np.asarray(seen.electric_field).reshape(self._size, -1)) ** 2)
+            arrived = hcipy.FresnelPropagator(self._grid, distance).forward(wave) if distance else wave
+            power.append(np.abs(np.asarray(arrived.electric_field).reshape(self._size, -1)) ** 2)
         return power
 
     @functools.cached_property
@@ -152,8 +152,8 @@ class HcipyBench:
 
     def error(self, phase, truth):
         """Rms error over the fully lit pixels of a phase (pixels) for a true one (fine, without the flat)."""
-        left = np.exp(1j * (np.asarray(phase) - self.on_pupil(truth + self.flat)))[self.fully_lit]
-        return np.angle(left * np.conj(left.mean())).std()
+        residual = np.exp(1j * (np.asarray(phase) - self.on_pupil(truth + self.flat)))[self.fully_lit]
+        return np.angle(residual * np.conj(residual.mean())).std()
 
     @property
     def truth(self):
@@ -172,15 +172,15 @@ class HcipyBench:
         """Errors of a fit over its error bars, by name; a share or blur of 0 is left out, as it is a limit."""
         limits = "leakage", "unmasked", "blur"
         pairs = ((fit[name], value) for name, value in self.truth.items() if value or name not in limits)
-        return {one.name: (one.value - value) / one.sigma for one, value in pairs}
+        return {number.name: (number.value - value) / number.sigma for number, value in pairs}
 
     def recording(self, n_commands=4, rms=0.5, seed=1):
         """Frames of the flat and of smooth commands, clear frames, and the commands on the pupil's grid."""
         commands = [np.zeros((self._size, self._size))]
         commands += [self.smooth(rms, seed=200 + number, n_modes=14) for number in range(n_commands)]
-        frames = np.stack([self.counts(one, (seed, number)) for number, one in enumerate(commands)])
+        frames = np.stack([self.counts(command, (seed, number)) for number, command in enumerate(commands)])
         clear = self.counts(commands[0], (seed, 99), masked=False)
-        return frames, clear, np.stack([self.on_pupil(one) for one in commands])
+        return frames, clear, np.stack([self.on_pupil(command) for command in commands])
 
 
 ERRORS = {
@@ -220,14 +220,14 @@ def _aperture(name, size, across):
     import hcipy
 
     grid = hcipy.make_pupil_grid(size, size / across)
-    made = {
+    aperture = {
         "disc": lambda: hcipy.make_circular_aperture(1),
         "VLT": lambda: hcipy.make_vlt_aperture(normalized=True),
         "LUVOIR": lambda: hcipy.make_luvoir_a_aperture(normalized=True),
         "GMT": lambda: hcipy.make_gmt_aperture(normalized=True),
         "Keck": lambda: hcipy.make_keck_aperture(normalized=True),
     }[name]()
-    return np.asarray(made(grid)).reshape(size, size)
+    return np.asarray(aperture(grid)).reshape(size, size)
 
 
 @functools.cache
@@ -236,5 +236,5 @@ def _modes(size, across, n):
     import hcipy
 
     grid = hcipy.make_pupil_grid(size, size / across)
-    modes = np.array([np.asarray(one).reshape(size, size) for one in hcipy.make_zernike_basis(n, 1, grid, 2)])
+    modes = np.array([np.asarray(mode).reshape(size, size) for mode in hcipy.make_zernike_basis(n, 1, grid, 2)])
     return modes, np.array([hcipy.noll_to_zernike(number)[0] for number in range(2, n + 2)])

@@ -23,9 +23,9 @@ def read(file):
 
 def addresses(soup):
     """Files that a page loads, and its links."""
-    found = {tag[key] for key in ("src", "poster", "data", "href") for tag in soup.find_all(attrs={key: True})}
+    places = {tag[key] for key in ("src", "poster", "data", "href") for tag in soup.find_all(attrs={key: True})}
     moved = soup.select("meta[http-equiv=refresh i]")
-    return found | {tag["content"].split("url=")[1] for tag in moved}
+    return places | {tag["content"].split("url=")[1] for tag in moved}
 
 
 @pytest.fixture(scope="module")
@@ -96,6 +96,8 @@ def test_prose_and_tables_have_powers_of_ten():
 
 def test_signatures_are_python():
     api = read(HTML / "book" / "api_reconstructors.html")
-    signatures = [one.get_text() for one in api.select("dt.sig") if "tolerance" in one.get_text()]
-    assert [one for one in signatures if re.search(r"10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]", one)] == []
-    assert any("1e-" in one for one in signatures)
+    signatures = [
+        signature.get_text() for signature in api.select("dt.sig") if "tolerance" in signature.get_text()
+    ]
+    assert [signature for signature in signatures if re.search(r"10[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]", signature)] == []
+    assert any("1e-" in signature for signature in signatures)

@@ -5,58 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
-import nbformat
 import pytest
 
 from book._ext import cards
 from book._tools.project import Project
 
 ROOT = Path(__file__).parent.parent
-
-
-@pytest.fixture
-def carded():
-    """Writes a notebook of code cells, the first with the parameters, and returns its cells with cards."""
-
-    def make(name, *sources, links=(), versions="not recorded", commit="not known"):
-        cells = [nbformat.v4.new_code_cell(source) for source in sources]
-        cells[0].metadata["tags"] = ["parameters"]
-        kernel = {"name": "python3", "language": "python", "display_name": "Python 3"}
-        made = nbformat.v4.new_notebook(cells=cells, metadata={"kernelspec": kernel})
-        cards.add_cards(made, name, dict(links), versions, commit)
-        return made.cells
-
-    return make
-
-
-def test_a_card_says_how_a_figure_was_made(carded):
-    cells = carded(
-        "fig03_range",
-        "rms = 0.5  # input, rad rms\nseed = 3",
-        'publish(figure, "fig03_range")',
-        "x = 1",
-        links={"fig03_range.png": "../run/fig03_range.png"},
-        versions="Python 3.12.1",
-        commit="`abc`",
-    )
-    assert [cell.cell_type for cell in cells] == ["code", "code", "markdown", "code", "markdown"]
-    assert all(text in cells[-1].source for text in ("`abc`", "Python 3.12.1"))
-    said = ["<../run/fig03_range.png>", 'href="../_downloads/fig03_range.zip"']
-    said += ['<div class="run-form" data-figure="fig03_range">']
-    assert not [text for text in said if text not in cells[2].source]
-    assert "CSV" not in cells[2].source, "there is no such file"
-
-
-def test_a_card_offers_the_files_that_exist_and_no_others():
-    names = ["one.png", "one.svg", "one_screens.csv", "two.csv"]
-    line = cards.files("some", "one", {name: f"../run/{name}" for name in names})
-    assert [name for name in names if f"<../run/{name}>" in line] == names[:3]
-    assert line.count("{download}") == 3
-
-
-def test_a_page_of_tables_has_a_form_too(carded):
-    [_, card, _] = carded("decision", "rms = 0.5")
-    assert 'class="run-form"' in card.source
 
 
 def test_the_commit_is_that_of_this_folder_alone(tmp_path):

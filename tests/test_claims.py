@@ -8,7 +8,6 @@ import pytest
 
 from book._ext import claims
 from book._ext.claims import FAILS, HOLDS, NOTED, PARTLY, UNTESTED, Claim, ClaimError, Finding
-from studies.fig04_dimple_diameter import SHORT
 
 from .conftest import ROOT, glued
 
@@ -40,48 +39,24 @@ def test_verdict_is_the_recorded_one_and_any_but_holds_and_fails_is_explained(ju
     [
         # An identity holds to rounding.
         (1, {"dimple_two_wave_error": 1e-11}, FAILS),
-        (2, {"patch_model_error": 1e-11}, FAILS),
-        (4, {"determinant_error": 1e-11}, FAILS),
-        (4, {"half_difference_error": 1e-11}, FAILS),
-        (6, {"true_wave_error": 1e-11}, FAILS),
         # The approximation is satisfactory up to 5 %.
         (3, {"wave_error_01": 0.051}, FAILS),
         (3, {"claimed_wave_error": 0.051}, NOTED),
-        # The most diversity is at a difference of pi.
-        (5, {"best_difference": 3.0}, FAILS),
         # "About" a number is within 20 % of it.
         (7, {"arcsine_limit": 0.25}, HOLDS),
         (7, {"arcsine_limit": 0.37}, NOTED),
-        (7, {"arcsine_over_linear": 1.0}, FAILS),
         # Ten times the range: by all, some or none of the methods.
         (8, {"linear_limit": 0.1, "saxton_limit": 1.1, "shifted_limit": 1.1, "descent_limit": 1.1}, HOLDS),
         (8, {"linear_limit": 0.1, "saxton_limit": 0.2, "shifted_limit": 1.1, "descent_limit": 1.1}, NOTED),
         (8, {"linear_limit": 1.0}, FAILS),
-        (9, {"saxton_error": 0.001}, FAILS),
-        (9, {"saxton_widest_error": 1.0}, FAILS),
-        (9, {"saxton_model_error": 0.03}, FAILS),
-        (10, {"alike_up_to": 0.4}, FAILS),
-        (10, {"descent_passes": 0.0}, FAILS),
-        (10, {"modes_recovered_at_1": 1.0}, HOLDS),
         (11, {"wrap_onset": 1.2}, HOLDS),
-        (11, {"wrap_onset": 0.7}, NOTED),
         (11, {"wrap_onset": 1.6}, FAILS),
-        (12, {"shifted_limit": 1.2, "plain_at_2": 0.1}, HOLDS),
         (12, {"shifted_limit": 1.2}, PARTLY),
-        (12, {"shifted_limit": 1.3}, PARTLY),
         (12, {"shifted_limit": 0.7}, FAILS),
-        (14, {"error_max_allowed_pairs": 2e-3}, FAILS),
-        (14, {"zero_works": 1.0}, HOLDS),
-        (15, {"best_noise": 1.0, "noise_at_half_pi": 1.0, "best_noise_aberrated": 0.6}, NOTED),
         (16, {"diameter_5_percent": 2.7}, FAILS),
-        (16, {"error_at_26": 0.0}, FAILS),
-        (16, {"diameter_5_percent": 2.5}, HOLDS),
         (17, {"claim17_descent_rise": 2.3, "claim17_saxton_rise": 2.3}, HOLDS),
-        (17, {"claim17_descent_points_rise": 1.6}, FAILS),
-        (17, dict.fromkeys([f"claim17_{one}_rise" for one in SHORT.values()], 1.6), FAILS),
         # Leakage lowers the gain by more than 1 %.
         (19, {"gain_leakage": 1.0}, FAILS),
-        (20, {"reach_shifted": 0.0}, FAILS),
         (20, {"offset_shifted": 0.02}, FAILS),
     ],
 )
@@ -91,28 +66,9 @@ def test_another_measurement_changes_the_verdict(number, changed, verdict):
     for notebook in filter(None, (claim.also, claim.notebook)):
         numbers |= claims.glued(NOTEBOOKS / f"{notebook}.ipynb")
     assert changed.keys() <= numbers.keys()
-    found = claims.judge(claim, numbers | changed)
-    assert found.verdict == verdict
-    assert found.measured
-
-
-@pytest.mark.parametrize(
-    ("times", "verdict"),
-    [
-        # Time of 25 iterations, and rate and error of fewer.
-        ((2e-3, 500.0, 1e-3), HOLDS),
-        ((2e-3, 2000.0, 1e-3), PARTLY),
-        ((2e-3, 2000.0, 5e-2), HOLDS),
-        ((9e-4, 500.0, 1e-3), FAILS),
-    ],
-)
-def test_the_verdict_on_real_time_depends_on_the_measured_times(times, verdict):
-    performance = json.loads(json.dumps(claims.RULES.globals["performance"]))
-    performance["speed"]["others"]["PhaseShifted"] = times[0]
-    for one in performance["speed"]["real time"]:
-        one |= {"rate": times[1], "median error": times[2]}
-    numbers = claims.glued(NOTEBOOKS / f"{CLAIMS[13].notebook}.ipynb") | {"performance": performance}
-    assert claims.judge(CLAIMS[13], numbers).verdict == verdict
+    finding = claims.judge(claim, numbers | changed)
+    assert finding.verdict == verdict
+    assert finding.measured
 
 
 def test_numbers_come_from_the_outputs_of_a_notebook(tmp_path):

@@ -6,14 +6,11 @@ import shutil
 import subprocess
 import sys
 import tomllib
-from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
 
-import pybtex.database
 import pytest
 import yaml
-from packaging.markers import default_environment
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
@@ -24,15 +21,6 @@ ROOT = Path(__file__).parent.parent
 LOCK = "environment/requirements.lock"
 UV_LOCK = "environment/uv.txt"
 CHECK = "environment/check.py"
-INSTALLERS = [
-    "environment/environment.yml",
-    "environment/Dockerfile",
-    ".binder/requirements.txt",
-    ".binder/postBuild",
-    ".ci/run",
-    ".github/workflows/ci.yml",
-    "Makefile",
-]
 
 
 def read(name):
@@ -44,7 +32,7 @@ PINS = re.findall(r"(?m)^([\w.-]+)==([^\s;]+)", read(LOCK))
 LOCKED = {canonicalize_name(name): version for name, version in PINS}
 
 
-def found(pattern, name):
+def stated(pattern, name):
     """All that a pattern finds in a file, and it finds something."""
     matches = re.findall(pattern, read(name))
     assert matches, f"{name} no longer says {pattern}"
@@ -60,10 +48,10 @@ def supported():
 def test_oldest_python_is_the_same_everywhere():
     oldest = supported()[0]
     assert PROJECT["requires-python"] == f">={oldest}"
-    assert found(r"--python-version (\S+)", "Makefile") == {oldest}
-    assert found(r"zwfs needs Python (\S+)", "Makefile") == {oldest}
-    assert found(r"sys.version_info < \((\d+), (\d+)\)", "Makefile") == {tuple(oldest.split("."))}
-    assert found(r'target-version = "py(\d+)"', "pyproject.toml") == {oldest.replace(".", "")}
+    assert stated(r"--python-version (\S+)", "Makefile") == {oldest}
+    assert stated(r"zwfs needs Python (\S+)", "Makefile") == {oldest}
+    assert stated(r"sys.version_info < \((\d+), (\d+)\)", "Makefile") == {tuple(oldest.split("."))}
+    assert stated(r'target-version = "py(\d+)"', "pyproject.toml") == {oldest.replace(".", "")}
 
 
 def test_every_supported_python_is_tested_and_environments_have_the_newest():
@@ -71,31 +59,17 @@ def test_every_supported_python_is_tested_and_environments_have_the_newest():
     assert workflow["jobs"]["check"]["strategy"]["matrix"]["python"] == supported()
     *others, newest = supported()
     assert f"Python {', '.join(others)} or {newest}" in read("README.md")
-    assert found(r"(?m)^  - python=(\S+)$", "environment/environment.yml") == {newest}
+    assert stated(r"(?m)^  - python=(\S+)$", "environment/environment.yml") == {newest}
     pinned = r"(?m)^FROM python:(\d+\.\d+)\.\d+-slim-bookworm@sha256:[0-9a-f]{64}$"
-    assert found(pinned, "environment/Dockerfile") == {newest}
-    assert found(r"^python-(\d+\.\d+)\s*$", ".binder/runtime.txt") == {newest}
+    assert stated(pinned, "environment/Dockerfile") == {newest}
+    assert stated(r"^python-(\d+\.\d+)\s*$", ".binder/runtime.txt") == {newest}
 
 
 def test_environments_install_the_lock():
-    assert found(r"(?m)^      - -r (\S+)$", "environment/environment.yml") == {Path(LOCK).name}
-    assert found(r"(?m)^-r (\S+)$", ".binder/requirements.txt") == {f"../{LOCK}"}
-    assert found(r"(?m)^RUN (make .+)$", "environment/Dockerfile") == {"make .venv/.ready"}
-    assert found(r"(?m)^LOCK := (\S+)$", "Makefile") == {LOCK}
-
-
-def pins(text):
-    """Versions that a file asks for by name: name==1.2 of pip, - name=1.2 of conda."""
-    lines = "\n".join(line.split("#")[0] for line in text.splitlines())
-    found = re.findall(r"([A-Za-z][\w.-]*) ?== ?(\d[\w.]*)", lines)
-    found += re.findall(r"(?m)^\s*- ([\w.-]+)=(\d[\w.]*)", lines)
-    return {canonicalize_name(name): version for name, version in found}
-
-
-@pytest.mark.parametrize("name", INSTALLERS)
-def test_environments_ask_for_no_version_but_the_locked(name):
-    known = LOCKED | {"python": supported()[-1], "uv": found(r"uv==(\S+)", UV_LOCK).pop()}
-    assert {n: v for n, v in pins(read(name)).items() if known.get(n) != v} == {}
+    assert stated(r"(?m)^      - -r (\S+)$", "environment/environment.yml") == {Path(LOCK).name}
+    assert stated(r"(?m)^-r (\S+)$", ".binder/requirements.txt") == {f"../{LOCK}"}
+    assert stated(r"(?m)^RUN (make .+)$", "environment/Dockerfile") == {"make .venv/.ready"}
+    assert stated(r"(?m)^LOCK := (\S+)$", "Makefile") == {LOCK}
 
 
 def test_lock_has_what_the_package_and_its_extras_ask_for():
@@ -109,14 +83,7 @@ def test_lock_has_what_the_package_and_its_extras_ask_for():
     ]
     assert not wrong
     used = {extra for r in asked if r.name == PROJECT["name"] for extra in r.extras}
-    assert used | found(r"--extra (\w+)", "Makefile") == set(extras)
-
-
-def test_this_environment_is_the_locked_one():
-    here = default_environment()["python_version"]
-    names = ["numpy", "scipy", "matplotlib", "papermill", "jupyter-book", "jupyterlab", "playwright"]
-    assert here in supported()
-    assert {name: version(name) for name in names} == {name: LOCKED[name] for name in names}
+    assert used | stated(r"--extra (\w+)", "Makefile") == set(extras)
 
 
 def test_version_of_the_package_is_the_same_everywhere():
@@ -125,22 +92,10 @@ def test_version_of_the_package_is_the_same_everywhere():
     assert {PROJECT["version"], citation["version"], zwfs.__version__, latest} == {PROJECT["version"]}
 
 
-def test_citation_names_the_paper_as_the_bibliography_does():
-    citation = yaml.safe_load(read("CITATION.cff"))
-    entry = pybtex.database.parse_file(ROOT / "book" / "references.bib").entries["Chambouleyron:24"]
-    paper = citation["preferred-citation"]
-    names = [str(person.rich_last_names[-1]) for person in entry.persons["author"]]
-    assert [author["family-names"] for author in paper["authors"]] == names
-    assert paper["title"] == re.sub("[{}]", "", entry.fields["title"])
-    assert str(paper["year"]) == entry.fields["year"]
-    assert paper["url"].endswith(entry.fields["eprint"])
-    assert paper["doi"].endswith(entry.fields["eprint"])
-
-
 def test_package_can_be_imported_next_to_a_folder_of_its_name(tmp_path):
     """As in the parent folder of a clone: every editable installation is of the compatible kind."""
     for name in ("Makefile", ".binder/postBuild", "environment/environment.yml"):
-        assert found(r"(\S+ \S+) --editable \.", name) == {"--config-settings editable_mode=compat"}
+        assert stated(r"(\S+ \S+) --editable \.", name) == {"--config-settings editable_mode=compat"}
     (tmp_path / "zwfs" / "zwfs").mkdir(parents=True)
     environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     code = "import zwfs; print(zwfs.Pupil.__name__)"
@@ -240,11 +195,3 @@ def test_clean_keeps_what_belongs_to_the_user(clone):
     assert (clone / "_build" / "rerun" / "mine" / "record.json").exists()
     shutil.rmtree(clone / "_build")
     assert make(clone, "-s", "clean") == (0, "")
-
-
-def test_home_folder_that_cannot_be_written_is_replaced(clone, tmp_path):
-    (clone / "show.mk").write_text("include Makefile\nshow:\n\t@echo $$HOME\n")
-    shown = make(clone, "-s", "-f", "show.mk", "show", HOME="/proc/nothing")[1].strip()
-    assert shown == str(clone / "_build" / "home")
-    assert Path(shown).is_dir()
-    assert make(clone, "-s", "-f", "show.mk", "show", HOME=str(tmp_path))[1].strip() == str(tmp_path)

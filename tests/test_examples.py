@@ -52,9 +52,9 @@ def test_table_of_delays_and_winds_is_that_of_the_example(capsys):
 
     for delay, *cells in rows:
         for speed, cell in zip((20, 10, 5), cells, strict=True):
-            found = {gain: residual(delay, speed, gain) for gain in (0.2, 0.4, 0.6, 0.8)}
-            best = min(found, key=found.get)
-            assert cell == f"{two_digits(found[best])}, gain {best}"
+            residuals = {gain: residual(delay, speed, gain) for gain in (0.2, 0.4, 0.6, 0.8)}
+            best = min(residuals, key=residuals.get)
+            assert cell == f"{two_digits(residuals[best])}, gain {best}"
 
 
 def test_example_of_a_verdict_needs_only_the_package(tmp_path, monkeypatch, capsys):

@@ -74,14 +74,6 @@ def test_an_edit_runs_the_notebooks_that_import_the_file(needs, changed, count):
     assert sum(ROOT / changed in files for files in needs.values()) == count
 
 
-def test_data_belong_to_the_study_of_their_name(needs):
-    data, study = (
-        {name for name in NAMES if BOOK.studies / file in needs[name]}
-        for file in ("calibration.npz", "calibration.py")
-    )
-    assert data == study
-
-
 FILES = {
     "zwfs/__init__.py": """
 from typing import TYPE_CHECKING
@@ -95,25 +87,17 @@ else:
     "zwfs/_lazy.py": "",
     "zwfs/pupil.py": "class Pupil: pass",
     "zwfs/sensor.py": "def read():\n    import zwfs.frames.files as files\n    return files.read()",
-    "zwfs/frames/__init__.py": """
-from typing import TYPE_CHECKING
-if TYPE_CHECKING:
-    from zwfs.frames import files
-    from zwfs.frames.verdict import judge
-""",
+    "zwfs/frames/__init__.py": "",
     "zwfs/frames/files.py": "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    import zwfs.sensor",
-    "zwfs/frames/verdict.py": "",
     "notebooks/studies/__init__.py": "",
-    "notebooks/studies/one.py": "from pathlib import Path\nfrom zwfs.pupil import Pupil",
-    "notebooks/studies/two.py": "from studies import one\ntable = 'shared.csv'",
+    "notebooks/studies/one.py": "from pathlib import Path\nfrom zwfs.pupil import Pupil\ntable = 'shared.csv'",
     "notebooks/studies/one.npz": "",
     "notebooks/studies/shared.csv": "",
     "notebooks/own.py": "",
 }
 INIT = {"zwfs/__init__.py", "zwfs/_lazy.py"}
-FRAMES = INIT | {"zwfs/frames/__init__.py"}
-ONE = {"notebooks/studies/__init__.py", "notebooks/studies/one.py", "notebooks/studies/one.npz"}
 PUPIL = INIT | {"zwfs/pupil.py"}
+FILES_OF_FRAMES = INIT | {"zwfs/frames/__init__.py", "zwfs/frames/files.py"}
 
 
 @pytest.fixture
@@ -124,44 +108,29 @@ def small(tmp_path):
     return Project(tmp_path)
 
 
-def needed(project, *cells):
-    project.source("chapter").write_text(writes(new_notebook(cells=[new_code_cell(cell) for cell in cells])))
-    return {file.relative_to(project.root).as_posix() for file in project.depends_on("chapter")}
-
-
 @pytest.mark.parametrize(
-    ("code", "expected"),
+    ("cells", "expected"),
     [
-        ("import numpy", set()),
-        ("from zwfs import Pupil", PUPIL),
-        ("import zwfs\nzwfs.Pupil.circular(3).shape", PUPIL),
-        ("import zwfs as z\nprint(z.Pupil)", PUPIL),
-        ("import zwfs\nzwfs.__version__", INIT),
-        ("import zwfs\nzwfs.judge()", FRAMES | {"zwfs/frames/verdict.py"}),
-        ("from zwfs import frames\nframes.files.read()", FRAMES | {"zwfs/frames/files.py"}),
-        ("import zwfs.frames.files", FRAMES | {"zwfs/frames/files.py"}),
-        ("from zwfs.sensor import read", FRAMES | {"zwfs/frames/files.py", "zwfs/sensor.py"}),
-        ("def late():\n    from studies import one as study", ONE | PUPIL),
+        (["import numpy"], set()),
+        (["from zwfs import Pupil"], PUPIL),
+        (["import zwfs as z", "print(z.Pupil)"], PUPIL),  # used in another cell
+        (["import zwfs\nzwfs.__version__"], INIT),
+        (["from zwfs.sensor import read"], FILES_OF_FRAMES | {"zwfs/sensor.py"}),
         (
-            "from studies import two",
-            ONE | PUPIL | {"notebooks/studies/two.py", "notebooks/studies/shared.csv"},
+            ["def late():\n    from studies import one as study"],
+            PUPIL | {f"notebooks/studies/{name}" for name in ("__init__.py", "one.py", "one.npz", "shared.csv")},
         ),
-        ("%matplotlib inline\nif colab:\n    !pip install zwfs", set()),
+        (["%matplotlib inline\nif colab:\n    !pip install zwfs"], set()),
     ],
 )
-def test_imports_of_every_kind_are_followed(small, code, expected):
-    assert needed(small, code) == expected
-
-
-def test_a_name_of_one_cell_is_used_in_another(small):
-    assert needed(small, "import zwfs", "zwfs.Pupil") == PUPIL
-
-
-def test_an_edit_changes_the_key_of_the_notebooks_that_need_the_file(small):
-    small.source("chapter").write_text(writes(new_notebook(cells=[new_code_cell("from zwfs.sensor import read")])))
+def test_imports_of_every_kind_are_followed_and_an_edit_of_such_a_file_changes_the_key(small, cells, expected):
+    notebook = new_notebook(cells=[new_code_cell(cell) for cell in cells])
+    small.source("chapter").write_text(writes(notebook))
+    needed = {file.relative_to(small.root).as_posix() for file in small.depends_on("chapter")}
+    assert needed == expected
     before = record.key(small, "chapter")
     for name, text in FILES.items():
         (small.root / name).write_text(f"{text}\n# changed")
-        assert (record.key(small, "chapter") != before) == (small.root / name in small.depends_on("chapter")), name
+        assert (record.key(small, "chapter") != before) == (name in expected), name
         (small.root / name).write_text(text)
     assert record.key(small, "chapter") == before

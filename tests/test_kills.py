@@ -55,18 +55,18 @@ def build(root):
 def results(root):
     """Bytes of the pages and of the notebooks; records hold the seconds of a run and are no result."""
     files = (file for part in ("html", "notebooks") for file in (root / "_build" / part).rglob("*"))
-    found = {file.relative_to(root).as_posix(): file.read_bytes() for file in files if file.is_file()}
-    return {name: content for name, content in found.items() if not name.endswith("sensor.json")}
+    contents = {file.relative_to(root).as_posix(): file.read_bytes() for file in files if file.is_file()}
+    return {name: content for name, content in contents.items() if not name.endswith("sensor.json")}
 
 
 def processes(root):
     """Processes that work in a folder."""
-    found = []
+    ids = []
     for place in Path("/proc").glob("[0-9]*"):
         with suppress(OSError):  # it has just ended
             if Path(os.readlink(place / "cwd")).is_relative_to(root):
-                found.append(place.name)
-    return found
+                ids.append(place.name)
+    return ids
 
 
 @pytest.mark.slow
@@ -88,8 +88,8 @@ def test_a_killed_build_leaves_the_earlier_book_and_the_next_one_gives_the_same_
             os.kill(process.pid, signal.SIGKILL)
             process.communicate()
         wait_until(lambda: not processes(small_book), 60)
-        kept = {name: content for name, content in expected.items() if "/html/" in name}
-        assert {name: one for name, one in results(small_book).items() if "/html/" in name} == kept, phase
+        pages = {name: content for name, content in expected.items() if "/html/" in name}
+        assert {name: content for name, content in results(small_book).items() if "/html/" in name} == pages, phase
     page.write_text(text, "utf-8")
     moved = small_book.rename(small_book.with_name("another folder"))
     build(moved)

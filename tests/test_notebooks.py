@@ -140,12 +140,6 @@ def test_cells_that_set_up_or_draw_are_folded_and_one_that_computes_is_not(path)
     assert computes
 
 
-@pytest.mark.parametrize("path", sorted(NOTEBOOKS.glob("*.ipynb")), ids=lambda path: path.stem)
-def test_no_page_shows_a_warning(path):
-    outputs = [output for cell in nbformat.read(path, 4).cells for output in cell.get("outputs", ())]
-    assert not [output.text for output in outputs if output.get("name") == "stderr"]
-
-
 def shown_code():
     """Each block of code that a page of the book shows, by the name of its file."""
     for path in sorted(NOTEBOOKS.glob("*.ipynb")):

@@ -78,8 +78,10 @@ def test_equations_are_numbered_through_the_book_and_those_of_the_paper_as_there
     named = {1: "eq-propagation", 6: "eq-arccos", 9: "eq-phase-shifted", 16: "eq-cost"}
     assert {number: labels[number - 1] for number in named} == named
     pages = [plain_book / "book" / page.replace(".md", ".html") for page in (*api.PAPER, "theory.md")]
-    found = [int(number.get_text().strip("()#\uf0c1")) for page in pages for number in read(page).select(".eqno")]
-    assert found == list(range(1, len(found) + 1))
+    numbers = [
+        int(number.get_text().strip("()#\uf0c1")) for page in pages for number in read(page).select(".eqno")
+    ]
+    assert numbers == list(range(1, len(numbers) + 1))
 
 
 def test_book_names_no_public_address(plain_book):

@@ -24,13 +24,8 @@ def test_manifest_names_every_notebook_and_no_missing_file():
     assert all(entry["comment"] for entry in check["manifest"])
     cited = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))["preferred-citation"]
     assert check["paper"]["reference"] == f"https://doi.org/{cited['doi']}"
-    authors = [f"{one['given-names']} {one['family-names']}" for one in cited["authors"]]
-    assert [one["name"] for one in check["paper"]["authors"]] == authors
-
-
-def test_every_supported_python_is_checked():
-    supported = re.findall(r"Python :: (3\.\d+)", (ROOT / "pyproject.toml").read_text("utf-8"))
-    assert f"PYTHONS ?= {' '.join(supported)} lowest\n" in (ROOT / "Makefile").read_text("utf-8")
+    authors = [f"{author['given-names']} {author['family-names']}" for author in cited["authors"]]
+    assert [author["name"] for author in check["paper"]["authors"]] == authors
 
 
 @pytest.mark.parametrize("name", ["ci.yml", "lock.yml", "release.yml"])
@@ -53,7 +48,7 @@ def test_workflows_pin_actions_and_have_the_least_privileges(name):
 @pytest.mark.parametrize(("pattern", "passes"), [("{}", True), (".*", False), ("{}.1", False)])
 def test_a_release_needs_the_version_of_the_package_in_its_tag(pattern, passes):
     workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text("utf-8"))
-    (step,) = [one for one in workflow["jobs"]["build"]["steps"] if "tag" in one.get("name", "")]
+    (step,) = [step for step in workflow["jobs"]["build"]["steps"] if "tag" in step.get("name", "")]
     tag = {"GITHUB_REF_NAME": f"v{pattern.format(zwfs.__version__)}"}
     done = subprocess.run(["bash", "-c", step["run"]], cwd=ROOT, env=os.environ | tag, capture_output=True)
     assert (done.returncode == 0) == passes

@@ -4,14 +4,12 @@ import os
 import shutil
 import subprocess
 import sys
-from pathlib import Path
 
 import nbformat
 import pytest
 from nbformat.v4 import new_code_cell, new_markdown_cell, new_notebook, new_output
 
 from book._tools import run
-from book._tools.environment import clean
 from book._tools.execute import NotebookError
 from book._tools.project import Project
 
@@ -118,7 +116,3 @@ def test_make_passes_no_variable_on_that_changes_a_result(hostile, tmp_path):
     passed = dict(line.split("=", 1) for line in done.stdout.splitlines() if "=" in line)
     names = set(hostile) - {"IPYTHONDIR", "LC_ALL"}
     assert (names & passed.keys(), passed["PYTHONUTF8"], passed["LC_ALL"]) == (set(), "1", "C.UTF-8")
-
-
-def test_settings_of_matplotlib_are_its_own():
-    assert Path(clean({})["MATPLOTLIBRC"]).is_file()

@@ -6,23 +6,11 @@ import pytest
 import zwfs
 from studies.beyond_range import FineCamera
 from studies.dark_zone import Drift, errors_of_one_photon, integrator_residual, kalman_limit, simulate
-from studies.decision import (
-    ONE_IMAGE,
-    TWO_IMAGES,
-    Loops,
-    Situation,
-    findings,
-    know_bench,
-    loop_rows,
-    open_rows,
-    shots,
-)
 from studies.identities import approximation_errors, arccosine_phase, pair_phase
 from studies.kit.curves import Limit, fitted_limit, refined_limit
 from studies.kit.setups import screens_at
 from studies.phase_amplitude import amplitude_maps, reconstruct
 from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
-from zwfs.bench import Bench
 
 TRUE = 1.6  # where 5 % of the screens fail
 
@@ -112,18 +100,6 @@ def test_the_error_of_an_ignored_amplitude_is_a_fixed_share_of_a_small_phase(pup
     assert 0.5 < shares[0] / (2 * 0.02) < 2
 
 
-def test_one_image_gets_the_light_that_two_share():
-    bench = Bench.ideal(n_pixels=40, extent=1.6, photons_per_image=1e10, flux_imbalance=0.2)
-    learnt = know_bench(bench, 1e6, 0.1, seed=5)
-    for photons in (50.0, 1e4):
-        images = shots(learnt, photons, np.zeros(bench.n_segments), np.random.SeedSequence(2))
-        assert [shot.counts.shape[0] for shot in images] == [1, 2]
-        light = [shot.counts.sum() for shot in images]
-        share = np.divide(light, 2 * photons * np.count_nonzero(bench.segments))
-        np.testing.assert_allclose(share[0], share[1], rtol=0.01)
-        assert 0.85 < share[0] < 1  # the masks send some of the light past the camera
-
-
 @pytest.fixture(scope="module")
 def drift():
     return Drift(zernike_basis(Pupil.circular(20), 6), 10.0, 500.0, n_cycles=60, n_screens=20, seed=1)
@@ -151,16 +127,3 @@ def test_a_simulated_loop_has_the_residual_of_the_formula(drift_sensors, drift):
     errors, gains = errors_of_one_photon(drift_sensors, drift)["best"], [0.2, 0.9]
     expected = integrator_residual(errors, drift, 1e8, gains)
     np.testing.assert_allclose(simulate(drift_sensors["best"], drift, 1e8, gains), expected, rtol=0.06)
-
-
-def test_the_sentences_say_which_case_each_number_of_images_wins():
-    situations = [Situation(0.5, 1e4), Situation(0.5, 100.0), Situation(0.1, 1e4)]
-    one, two = dict.fromkeys(ONE_IMAGE, np.full(4, 0.1)), dict.fromkeys(TWO_IMAGES, np.full(4, 0.02))
-    cases = [one | {name: factor * error for name, error in two.items()} for factor in (1, 5, 100)]
-    loops = [{"Linear": Loops(0.6, np.array([0.1, 0.9])), "LinearTwo": Loops(0.2, np.array([0.1, 0.2]))}]
-    open_loop = open_rows({"real": situations}, {"real": cases})
-    text = findings(open_loop, loop_rows([Situation(1.0, 1.0)], loops)).markdown
-    assert "in 1 of 3 cases" in text
-    assert "About equal: bench with errors, 0.5 rad rms, 100 photons." in text
-    assert "One image is better: bench with errors, 0.1 rad rms, 10000 photons." in text
-    assert "2 instead of 1 at 1 rad rms and 1 photon." in text

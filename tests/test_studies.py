@@ -75,8 +75,8 @@ def test_approximation_is_right_to_second_order_in_amplitude_only(shifted, scree
     assert large.two_images / small.two_images == pytest.approx(2, rel=0.05)
 
 
-def test_camera_pixels_are_means_and_a_whole_pixel_of_displacement_is_one(shifted, modes):
-    camera = FineCamera(shifted, modes, 4)
+def test_camera_pixels_are_means_and_a_whole_pixel_of_displacement_is_one(shifted):
+    camera = FineCamera(shifted, 30, 4)
     assert camera.mean(np.arange(64.0).reshape(8, 8)).tolist() == [[13.5, 17.5], [45.5, 49.5]]
     fine = np.where(camera.pupil.inside, screens_at(camera.modes, 0.3, 2, 1, 0), 0)
     still, moved = camera.frames(fine), camera.frames(fine, 1.0)

@@ -123,7 +123,7 @@ class Optics:
 
     @property
     def focal_masks(self) -> tuple[Mask, ...]:
-        """Masks of the images: `masks`, or dimples."""
+        """What `masks` gives, or dimples of the phase shifts, one for each image."""
         return self.masks or tuple(Dimple(self.diameter, shift) for shift in self.phase_shifts)
 
     @property

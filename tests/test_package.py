@@ -104,6 +104,8 @@ def test_pip_installs_the_package_that_the_front_page_offers(tmp_path):
     subprocess.run([*pip, "zwfs.zip"], cwd=tmp_path, check=True, capture_output=True)
     here = tmp_path / "here"
     installed = {
-        file.relative_to(here).as_posix() for file in here.rglob("zwfs/**/*") if file.suffix in (".py", ".typed", ".npz")
+        file.relative_to(here).as_posix()
+        for file in here.rglob("zwfs/**/*")
+        if file.suffix in (".py", ".typed", ".npz")
     }
     assert installed == set(package(Project(ROOT)))

@@ -94,7 +94,7 @@ def draw_reference_intensities(frames: NDArray, clear_frames: NDArray) -> Figure
 
 def error_table(bench: Bench) -> Table:
     """Size of each error of the bench."""
-    rows = [[name, float(getattr(bench, name)), unit] for name, unit in UNITS.items()]
+    rows = [[name.replace("_", " "), float(getattr(bench, name)), unit] for name, unit in UNITS.items()]
     return Table(["error", "value", "unit"], rows)
 
 
@@ -190,8 +190,8 @@ def findings(commanded: NDArray, errors: Mapping[str, NDArray]) -> Text:
     folded = commanded < _FOLDED
     if folded.any():
         text += (
-            f" The linear method misses {np.median(np.abs(linear / commanded)[folded]):.0%} of the pistons below "
-            f"{_FOLDED:.0f} rad (median of {folded.sum()})."
+            f" For pistons below {_FOLDED:.0f} rad, the linear estimate is wrong by "
+            f"{np.median(np.abs(linear / commanded)[folded]):.0%} of the piston (median of {folded.sum()})."
         )
     return Text(text)
 

@@ -347,29 +347,29 @@ def _verdict(fit: BenchFit) -> str:
     return "consistent" if fit.consistent else "not consistent"
 
 
-def findings(errors: Errors, faint: Errors, photons: float, not_smooth: NDArray) -> Text:
+def findings(errors: Errors, faint: Errors, photons: Sequence[float], not_smooth: NDArray) -> Text:
     """Say what the fitted model gains on unseen screens, and whether its error bars hold."""
     plain, calibrated = errors.column("plain"), errors.column("calibrated")
     gains, bulk = plain / calibrated, plain / not_smooth
     every = [screen for row in errors.measured for screen in row]
     [faint_plain], [faint_calibrated] = faint.column("plain"), faint.column("calibrated")
     short = errors.rms[calibrated > _SHORT * errors.column("sigma")]
-    bars = (
-        f" Their error bars are too small at {', '.join(f'{rms:.2g}' for rms in short)} rad rms: the error "
-        f"exceeds {_SHORT:g} times the bar."
-        if short.size
-        else ""
-    )
+    ratio = calibrated / errors.column("sigma")
+    bars = ""
+    if short.size:
+        listed = ", ".join(f"{rms:.2g}" for rms in short)
+        bars = f" At {listed} rad rms the bars are too short: the error is up to {ratio.max():.2g} times the bar."
     return Text(
-        "The fitted model and the assumption of smooth phases together change the error of unseen *screens* "
-        f"(random phase maps) by a factor of {1 / gains.max():.2g} to {1 / gains.min():.2g}, compared with the "
-        "phase-shifted iteration and the mask's design values. Without the assumption (`calibrate --commands`, "
-        f"diamonds) the factor is {1 / bulk.max():.2g} to {1 / bulk.min():.2g}. At {faint.rms[0]:.2g} rad rms "
-        f"and {photons:.0f} photons per pixel, the error is {faint_calibrated:.2g} instead of {faint_plain:.2g} "
-        f"rad rms.\n\nOf the pixels of all screens, {np.mean([screen.inside for screen in every]):.0%} have an "
-        f"error below their error bar; 68 % are expected.{bars} The verdict is *consistent* for "
-        f"{sum(screen.consistent for screen in every)} of {len(every)} screens. It tests whether the model "
-        "explains the frames, not whether the phase is right."
+        f"In bright light ({photons[0]:.0f} photons per pixel), the fitted model and the assumption of smooth "
+        "phases together change the error of unseen *screens* (random phase maps) by a factor of "
+        f"{1 / gains.max():.2g} to {1 / gains.min():.2g}, compared with the phase-shifted iteration and the "
+        "mask's design values. Without the assumption (`calibrate --commands`, diamonds) the factor is "
+        f"{1 / bulk.max():.2g} to {1 / bulk.min():.2g}. In faint light ({photons[-1]:.0f} photons), at "
+        f"{faint.rms[0]:.2g} rad rms, the error is {faint_calibrated:.2g} instead of {faint_plain:.2g} rad "
+        f"rms.\n\nOf the pixels of all bright screens, {np.mean([screen.inside for screen in every]):.0%} have "
+        f"an error below their error bar; 68 % are expected.{bars} The verdict is *consistent* for "
+        f"{sum(screen.consistent for screen in every)} of {len(every)} of these screens. It tests whether the "
+        "model explains the frames, not whether the phase is right."
     )
 
 

@@ -381,7 +381,8 @@ def findings_saxton(
     ]
     return Text(
         f"With zero field, the error at {by_width.rms[0]:g} rad rms is {'; '.join(zeros)}. With the modelled "
-        f"field and {variants[repaired].settings.n_iterations} iterations, the error stays within "
+        f"field and {variants[repaired].settings.n_iterations} iterations, on a detector of "
+        f"{variants[repaired].sensor.extent:g} D, the error stays within "
         f"{percent(threshold)} of the input {_reach(by_width, longer)}."
     )
 

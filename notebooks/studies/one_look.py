@@ -262,15 +262,15 @@ def draw_found(found: FoundBench) -> Figure:
     return figure
 
 
-def findings(curves: Mapping[str, LookCurves]) -> Text:
+def findings(curves: Mapping[str, LookCurves], photons: float) -> Text:
     """Say how near one learned solve comes to the other methods and to the bound, for each kind of screens."""
     rms = next(iter(curves.values())).rms
     middle, last = _at(rms, 0.8), int(np.argmax(rms))
     ratios = [f"{shown.error(LEARNED)[middle] / shown.error(PLAIN)[middle]:.2f}" for shown in curves.values()]
     times = " and ".join(f"{ratio} times ({kind})" for kind, ratio in zip(curves, ratios, strict=True))
     lead = (
-        f"**At {rms[middle]:g} rad rms, one solve with the learned reference wave has {times} the error of the "
-        "converged iteration.**"
+        f"**At {rms[middle]:g} rad rms and {photons:g} photons per point and image, one solve with the learned "
+        f"reference wave has {times} the error of the converged iteration.**"
     )
     return Text("\n".join([lead, "", *(_finding(kind, shown, middle, last) for kind, shown in curves.items())]))
 
@@ -290,15 +290,16 @@ def _finding(kind: str, curves: LookCurves, middle: int, last: int) -> str:
     )
 
 
-def findings_bench(curves: BenchCurves) -> Text:
+def findings_bench(curves: BenchCurves, flux_ratio: float) -> Text:
     """Say what the errors of the bench cost with each of `WAYS`, at the largest leakage."""
     last = int(np.argmax(curves.leakages))
     errors = {way: f"{small(curves.error(way)[last])} rad" for way in WAYS}
     return Text(
-        f"**With a leakage of {100 * curves.leakages[last]:.3g} %, the iteration with the nominal model has an "
-        f"error of {errors[NOMINAL]}, and one learned solve that reads the bench from the same two images has "
-        f"{errors[LEARNED]}.** With the true values of the bench, the iteration has {errors[TRUE]}. The network "
-        f"that was trained without errors of the bench has {errors[UNTRAINED]}."
+        f"**With a leakage of {100 * curves.leakages[last]:.3g} % and a flux ratio of {flux_ratio:.3g}, the "
+        f"iteration with the nominal model has an error of {errors[NOMINAL]}, and one learned solve that reads "
+        f"the bench from the same two images has {errors[LEARNED]}.** With the true values of the bench, the "
+        f"iteration has {errors[TRUE]}. The network that was trained without errors of the bench has "
+        f"{errors[UNTRAINED]}."
     )
 
 

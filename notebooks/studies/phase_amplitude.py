@@ -248,7 +248,7 @@ def draw_phase_and_amplitude(
         else:
             shown = show_intensity(axes, image, largest)
         axes.set_title(f"amplitude,\n{title}", fontsize=10)
-        figure.colorbar(shown, ax=axes, shrink=0.85)
+        figure.colorbar(shown, ax=axes, label="amplitude (mean = 1)", shrink=0.85)
     return figure
 
 
@@ -289,8 +289,8 @@ def findings_example(pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate:
         sizes.append(two_digits(np.sqrt(np.mean(pupil.gather(error) ** 2))))
         shares.append(f"{np.mean(np.abs(pupil.gather(error)) < pupil.gather(sigma)):.0%}")
     return Text(
-        f"The error of the phase is {sizes[0]} rad rms, and that of the amplitude {sizes[1]}. {shares[0]} and "
-        f"{shares[1]} of the points are within one standard error; 68% are expected."
+        f"In this example the error of the phase is {sizes[0]} rad rms, and that of the amplitude {sizes[1]}. "
+        f"{shares[0]} and {shares[1]} of the points are within one standard error; 68% are expected."
     )
 
 

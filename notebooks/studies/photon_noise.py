@@ -242,7 +242,7 @@ def _cells(first: NDArray, second: NDArray) -> list[list[str]]:
     return [[f"{a:.2f}/{b:.2f}" for a, b in zip(*row, strict=True)] for row in rows]
 
 
-def findings(curves: PhotonCurves) -> Text:
+def findings(curves: PhotonCurves, diameter: float) -> Text:
     """Return how far the errors of the methods are above the bound."""
     bright, middle = _bright(curves), curves.rms.size // 2
     likely, shifted, arcsine, saxton = (
@@ -251,11 +251,12 @@ def findings(curves: PhotonCurves) -> Text:
     )
     share = 1 / (1 + _more_photons(curves, middle))
     return Text(
-        f"**With at least {curves.photons[bright].min():g} photons per point and image, the error of maximum "
-        f"likelihood is at most {likely} times the bound, and that of the phase-shifted iteration at most "
-        f"{shifted} times.** At {curves.rms[middle]:g} rad rms, an estimate at the bound would reach the error of "
-        f"the iteration with {two_digits(100 * share)} % of the photons. The error of the arcsine is up to "
-        f"{arcsine} times the bound, and that of Gerchberg-Saxton up to {saxton} times."
+        f"**With dimples of {diameter:g} λ/D and at least {curves.photons[bright].min():g} photons per point "
+        f"and image, the error of maximum likelihood is at most {likely} times the bound, and that of the "
+        f"phase-shifted iteration at most {shifted} times.** At {curves.rms[middle]:g} rad rms, an estimate at "
+        f"the bound would reach the error of the iteration with {two_digits(100 * share)} % of the photons. The "
+        f"error of the arcsine is up to {arcsine} times the bound, and that of Gerchberg-Saxton up to {saxton} "
+        "times."
     )
 
 

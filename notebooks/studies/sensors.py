@@ -466,8 +466,8 @@ def conditions_table(curves: SensorCurves, rms: float, read_noise: float) -> Tab
     header = [
         "sensor",
         "images",
-        f"light beside them, {input_}",
-        "cost: all light",
+        f"light beside the images, {input_}",
+        f"cost, {input_}: all light",
         "cost: only pupil images",
         f"cost: read noise {read_noise:g} e⁻",
         "fit recovers up to (rad rms)",

@@ -151,8 +151,8 @@ def fresnel(field, distance, n_wide):
     axis = np.arange(n_wide) / N
     frequency = (np.arange(n_wide) - n_wide // 2) * N / n_wide
     fourier = np.exp(-2j * np.pi * np.outer(frequency, axis))
-    one = np.exp(-1j * np.pi * distance * frequency**2)
-    operator = fourier.conj().T @ (one[:, np.newaxis] * fourier) / n_wide
+    propagation = np.exp(-1j * np.pi * distance * frequency**2)
+    operator = fourier.conj().T @ (propagation[:, np.newaxis] * fourier) / n_wide
     wide = operator @ np.pad(field, pad) @ operator.T
     return wide[pad : pad + len(field), pad : pad + len(field)]
 
@@ -215,9 +215,9 @@ def test_static_aberration_is_smooth_and_has_its_rms(perfect):
     rest = values - low.T @ np.linalg.lstsq(low.T, values)[0]
     assert rest.std() < 1e-5
     # It belongs to the bench: half of it has the same shape, another seed another one.
-    half, other = phase_of(ideal(static=0.15))[LAYOUT.inside], phase_of(ideal(static=0.3, seed=1))[LAYOUT.inside]
+    half, fresh = phase_of(ideal(static=0.15))[LAYOUT.inside], phase_of(ideal(static=0.3, seed=1))[LAYOUT.inside]
     np.testing.assert_allclose(2 * (half - half.mean()), values, atol=1e-5)
-    assert abs(np.corrcoef(other, values)[0, 1]) < 0.9
+    assert abs(np.corrcoef(fresh, values)[0, 1]) < 0.9
 
 
 def test_quilting_has_its_rms_and_22_periods(perfect):
@@ -242,9 +242,9 @@ def test_static_and_quilting_add_to_the_commands(commands):
 
 @pytest.mark.parametrize("illumination", [0.5, 1.5])
 def test_illumination_shows_in_the_pupil_images(illumination):
-    left, right = ideal(illumination=illumination).clear_frames()
-    np.testing.assert_array_equal(left, right)
-    values = inner(left)[LAYOUT.inside]
+    first, second = ideal(illumination=illumination).clear_frames()
+    np.testing.assert_array_equal(first, second)
+    values = inner(first)[LAYOUT.inside]
     slope, mean = np.polyfit(LAYOUT.points[:, 0], values, 1)
     assert slope / mean == pytest.approx(illumination)
     assert values.mean() == pytest.approx(1)
@@ -299,15 +299,15 @@ def test_commands_are_in_the_order_of_the_numbers(perfect):
 
 
 def test_bench_keeps_its_aberrations_to_itself():
-    one, other = (Bench(**SMALL, static=value, quilting=value, seed=seed) for value, seed in ((0.1, 1), (0.5, 2)))
+    low, high = (Bench(**SMALL, static=value, quilting=value, seed=seed) for value, seed in ((0.1, 1), (0.5, 2)))
     own = {"static", "quilting", "seed"}
-    names = [name for name in dir(one) if not name.startswith("_") and name not in own]
+    names = [name for name in dir(low) if not name.startswith("_") and name not in own]
     assert {"segments", "numbers", "n_pixels"} <= set(names)
-    shown = [name for name in names if not callable(getattr(one, name))]
+    shown = [name for name in names if not callable(getattr(low, name))]
     for name in shown:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)
-    pistons = np.linspace(-1, 1, one.n_segments)
-    np.testing.assert_array_equal(one.commanded_phase(pistons), other.commanded_phase(pistons))
+        np.testing.assert_array_equal(getattr(low, name), getattr(high, name), name)
+    pistons = np.linspace(-1, 1, low.n_segments)
+    np.testing.assert_array_equal(low.commanded_phase(pistons), high.commanded_phase(pistons))
 
 
 def test_model_knows_no_more_than_the_images_show(perfect, model):
@@ -334,27 +334,27 @@ def test_model_amplitude_is_close_to_the_truth_on_the_bench_as_it_is():
     bench = Bench()
     layout = Pupil.hexagonal(136, 3, 0.02, (21,), 0.8)
     truth = Pupil.from_segments(layout.segments, np.sqrt(1 + 0.5 * layout.x)).amplitude
-    found = BenchModel.from_images(bench, seed=1).shifted.pupil
-    assert found.inside[layout.inside].mean() > 0.999
+    pupil = BenchModel.from_images(bench, seed=1).shifted.pupil
+    assert pupil.inside[layout.inside].mean() > 0.999
     missing = Pupil.hexagonal(136, 3, 0.02, (), 0.8).segments == 21
-    assert found.inside[missing].mean() < 0.35  # its edges catch some light
-    ratio = (found.amplitude / truth.clip(0.1))[layout.inside]
+    assert pupil.inside[missing].mean() < 0.35  # its edges catch some light
+    ratio = (pupil.amplitude / truth.clip(0.1))[layout.inside]
     assert ratio.std() / ratio.mean() < 0.1
     # Away from gaps and edges, where diffraction is at home, it is much closer.
     deep = ndimage.binary_erosion(layout.inside, iterations=4)[layout.inside]
     assert ratio[deep].std() / ratio[deep].mean() < 0.04
-    assert not found.inside[np.hypot(layout.x, layout.y[:, np.newaxis]) > 0.5].any()
+    assert not pupil.inside[np.hypot(layout.x, layout.y[:, np.newaxis]) > 0.5].any()
 
 
 def test_normalised_counts_are_1_on_average_in_the_pupil():
     bench = ideal(photons_per_image=1e9, read_noise=30, background=5000, flux_imbalance=0.2)
-    found = BenchModel.from_images(bench, 1)
-    off = found.normalise(bench.clear_frames(2))
+    model = BenchModel.from_images(bench, 1)
+    off = model.normalise(bench.clear_frames(2))
     np.testing.assert_allclose(inner(off)[:, LAYOUT.inside].mean(axis=1), 1, atol=1e-3)
     assert off.min() < 0  # noise around 0 is left as it is
-    np.testing.assert_allclose(found.normalise(found.dark), 0)
+    np.testing.assert_allclose(model.normalise(model.dark), 0)
     frames = bench.frames(np.zeros((3, 36)), 2)
-    np.testing.assert_array_equal(found.normalise(frames)[1], found.normalise(frames[1]))
+    np.testing.assert_array_equal(model.normalise(frames)[1], model.normalise(frames[1]))
 
 
 # Pistons
@@ -366,13 +366,13 @@ def test_pistons_are_circular_means_over_finite_points(model):
     phase = np.einsum("bk,kyx->byx", truth, model.modes)
     noisy = phase + np.where(rng.uniform(size=phase.shape) < 0.5, 0.8, -0.8)
     wrapped = np.angle(np.exp(1j * noisy))
-    found = model.pistons(wrapped)
+    pistons = model.pistons(wrapped)
     for batch in range(2):
         for index, number in enumerate(model.numbers):
             values = wrapped[batch][model.segments == number]
             expected = np.arctan2(np.sin(values).sum(), np.cos(values).sum())
-            assert found[batch, index] == pytest.approx(expected, abs=1e-12)
-    np.testing.assert_allclose(np.cos(found - truth), 1, atol=0.2)
+            assert pistons[batch, index] == pytest.approx(expected, abs=1e-12)
+    np.testing.assert_allclose(np.cos(pistons - truth), 1, atol=0.2)
     holes = np.where(rng.uniform(size=phase.shape) < 0.3, np.nan, phase)
     holes[:, model.segments == 0] = np.nan
     np.testing.assert_allclose(model.pistons(holes), truth, atol=1e-12)
@@ -384,9 +384,9 @@ def test_segment_residual_is_blind_to_piston_and_turns():
     commanded, error = rng.normal(size=(2, 4, 36))
     error *= 0.2
     turns = 2 * np.pi * rng.integers(-2, 3, error.shape)
-    found = segment_residual(commanded + error + turns + 1.7, commanded)
-    np.testing.assert_allclose(np.exp(1j * (found - error)) / np.exp(1j * (found - error))[:, :1], 1, atol=1e-12)
-    np.testing.assert_allclose(np.angle(np.exp(1j * found).mean(axis=1)), 0, atol=1e-12)
+    rest = segment_residual(commanded + error + turns + 1.7, commanded)
+    np.testing.assert_allclose(np.exp(1j * (rest - error)) / np.exp(1j * (rest - error))[:, :1], 1, atol=1e-12)
+    np.testing.assert_allclose(np.angle(np.exp(1j * rest).mean(axis=1)), 0, atol=1e-12)
     single = np.zeros(36)
     single[3] = 3.0
     assert segment_residual(single, np.zeros(36))[3] == pytest.approx(3.0, abs=0.1)
@@ -430,6 +430,6 @@ def test_bad_parameters_are_named(change):
 
 def test_numbers_of_other_types_are_kept_as_plain_ones():
     small = {name: np.int8(value) if isinstance(value, int) else value for name, value in SMALL.items()}
-    other = Bench(**small, seed=np.uint8(1), focus_difference=Fraction(1, 10**4))
+    converted = Bench(**small, seed=np.uint8(1), focus_difference=Fraction(1, 10**4))
     plain = Bench(**SMALL, seed=1, focus_difference=1e-4)
-    np.testing.assert_array_equal(other.frames(seed=2), plain.frames(seed=2))
+    np.testing.assert_array_equal(converted.frames(seed=2), plain.frames(seed=2))

@@ -31,10 +31,10 @@ class Recorded:
         self.bench = HcipyBench(**OPTICS, **TURNED, **MAPS, **bench)
         frames, clear, self.phases = self.bench.recording(n_commands)
         self.bad = np.random.default_rng(5).random(clear.shape) < 0.002
-        self.frames, self.clear = (np.where(self.bad, np.nan, one) for one in (frames, clear))
+        self.frames, self.clear = (np.where(self.bad, np.nan, images) for images in (frames, clear))
         screens = [self.bench.smooth(rms, 1000 + index) for index in range(n_unseen)]
-        self.unseen = np.stack([self.bench.counts(one, (7, index)) for index, one in enumerate(screens)])
-        self.truth = np.stack([self.bench.on_pupil(one + self.bench.flat) for one in screens])
+        self.unseen = np.stack([self.bench.counts(screen, (7, index)) for index, screen in enumerate(screens)])
+        self.truth = np.stack([self.bench.on_pupil(screen + self.bench.flat) for screen in screens])
 
     def calibration(self, **settings):
         bench = self.bench
@@ -50,9 +50,9 @@ class Recorded:
 
         pairs = [list(map(image, pair, self.bad)) for pair in (frame, self.clear)]
         measured = pipeline.reduce_frames(registration.register_frames(*pairs), pipeline.Optics())
-        found = Calibration.of(measured)
+        calibration = Calibration.of(measured)
         margin = (self.bench.side - self.bench.pixels) // 2
-        return found, np.rint(found.places[0, :, 0, 0]).astype(int) - margin
+        return calibration, np.rint(calibration.places[0, :, 0, 0]).astype(int) - margin
 
     def errors(self, phase, corner=(0, 0)):
         """Phases less the truth, NaN where they are, on the grid of the truth."""
@@ -60,8 +60,8 @@ class Recorded:
         whole = np.full((len(phase), n + 2 * wide, n + 2 * wide), np.nan)
         row, column = wide + corner[0], wide + corner[1]
         whole[:, row : row + phase.shape[1], column : column + phase.shape[2]] = phase
-        left = np.exp(1j * (whole[:, wide:-wide, wide:-wide] - self.truth))
-        return np.angle(left / np.nanmean(left, axis=(1, 2), keepdims=True))
+        waves = np.exp(1j * (whole[:, wide:-wide, wide:-wide] - self.truth))
+        return np.angle(waves / np.nanmean(waves, axis=(1, 2), keepdims=True))
 
 
 def rms(errors, where):
@@ -70,7 +70,7 @@ def rms(errors, where):
 
 
 @pytest.fixture(scope="module")
-def taken():
+def recorded():
     return Recorded(12, 4, 0.4, pixels=24, side=32)
 
 
@@ -80,15 +80,15 @@ def wide(pairs):
 
 
 @pytest.fixture(scope="module")
-def files(taken, tmp_path_factory):
+def files(recorded, tmp_path_factory):
     """Folder with files of the bench: two exposures of each state, a dark, and unseen screens."""
     folder = tmp_path_factory.mktemp("bench")
     arrays = {
-        "frames": 200 + wide(np.repeat(taken.frames, 2, axis=0)),
-        "clear": 200 + wide(np.stack([taken.clear] * 2)),
-        "dark": np.full(wide(taken.clear).shape, 200.0),
-        "commands": taken.phases,
-        "unseen": 200 + wide(taken.unseen),
+        "frames": 200 + wide(np.repeat(recorded.frames, 2, axis=0)),
+        "clear": 200 + wide(np.stack([recorded.clear] * 2)),
+        "dark": np.full(wide(recorded.clear).shape, 200.0),
+        "commands": recorded.phases,
+        "unseen": 200 + wide(recorded.unseen),
     }
     for name, array in arrays.items():
         np.save(folder / f"{name}.npy", array)
@@ -96,19 +96,19 @@ def files(taken, tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def command(taken, files):
+def command(recorded, files):
     """Calibration that the command makes with known commands, and what it says."""
-    side, said = taken.bench.side, io.StringIO()
+    side, said = recorded.bench.side, io.StringIO()
     said.isatty = lambda: True
     centers = [str(place) for place in (side / 2 - 0.5, side / 2 - 0.5, side / 2 - 0.5, 1.5 * side - 0.5)]
     names = ["--frames", "frames.npy", "--pupils", "clear.npy", "--dark", "dark.npy", "--commands", "commands.npy"]
-    known = ["--pupil-centers", *centers, "--pupil-diameter", "24", "--noise", str(taken.bench.noise)]
+    options = ["--pupil-centers", *centers, "--pupil-diameter", "24", "--noise", str(recorded.bench.noise)]
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings(action="ignore"):
         patch.chdir(files)
         patch.setattr(sys, "stderr", said)
         quick = {"n_steps": 4, "oversampling": 2}
-        patch.setattr("zwfs.frames._calibrate.fit_bench", lambda *data, **given: fit_bench(*data, **given | quick))
-        assert main(["calibrate", "bench.npz", *names, *known]) == 0, said.getvalue()
+        patch.setattr("zwfs.frames._calibrate.fit_bench", lambda *data, **rest: fit_bench(*data, **rest | quick))
+        assert main(["calibrate", "bench.npz", *names, *options]) == 0, said.getvalue()
     return Calibration.load(files / "bench.npz"), said.getvalue()
 
 
@@ -118,41 +118,41 @@ def calibration(command):
 
 
 @pytest.fixture(scope="module")
-def found(taken, calibration):
-    return calibration(wide(np.where(taken.bad, np.nan, taken.unseen)))
+def estimate(recorded, calibration):
+    return calibration(wide(np.where(recorded.bad, np.nan, recorded.unseen)))
 
 
-def test_quick_calibration_needs_no_flat_mirror(taken):
-    aberrated = taken.bench.counts(taken.bench.smooth(1.0, 5), 6)
-    calibrations = [taken.quick(), taken.quick(aberrated)]
-    phases = [quick(taken.unseen).phase for quick, _ in calibrations]
+def test_quick_calibration_needs_no_flat_mirror(recorded):
+    aberrated = recorded.bench.counts(recorded.bench.smooth(1.0, 5), 6)
+    calibrations = [recorded.quick(), recorded.quick(aberrated)]
+    phases = [quick(recorded.unseen).phase for quick, _ in calibrations]
     np.testing.assert_array_equal(*[corner for _, corner in calibrations])
     change = phases[1] - phases[0]
     assert rms(change, np.isfinite(change).all(axis=0)) < 0.03
 
 
-def test_phases_are_better_than_those_of_the_quick_calibration(taken, found):
-    assert not found.flags.any()
-    quick, corner = taken.quick()
-    before = taken.errors(quick(taken.unseen).phase, corner)
-    after, lit = taken.errors(found.phase), taken.bench.fully_lit
+def test_phases_are_better_than_those_of_the_quick_calibration(recorded, estimate):
+    assert not estimate.flags.any()
+    quick, corner = recorded.quick()
+    before = recorded.errors(quick(recorded.unseen).phase, corner)
+    after, lit = recorded.errors(estimate.phase), recorded.bench.fully_lit
     assert rms(after, lit) < 0.5 * rms(before, lit)
     assert rms(after, lit) < 0.03
 
 
-def test_error_bars_hold_for_points_and_modes(taken, calibration, found):
-    errors, lit = taken.errors(found.phase), taken.bench.fully_lit
-    photons, noise = calibration.unit.mean(), taken.bench.noise
+def test_error_bars_hold_for_points_and_modes(recorded, calibration, estimate):
+    errors, lit = recorded.errors(estimate.phase), recorded.bench.fully_lit
+    photons, noise = calibration.unit.mean(), recorded.bench.noise
     inner = ndimage.binary_erosion(lit, iterations=2)
-    assert 0.8 < rms(errors / calibration.sigma(found, photons, noise), inner) < 1.3
+    assert 0.8 < rms(errors / calibration.sigma(estimate, photons, noise), inner) < 1.3
     modes = zernike_basis(calibration.sensor.pupil, 20)
-    left = calibration.sensor.pupil.gather(np.where(lit, np.nan_to_num(errors), 0)) @ calibration.modal_matrix(
-        modes
-    )
-    assert 0.6 < np.sqrt(np.mean((left / calibration.sigma(found, photons, noise, modes)) ** 2)) < 1.6
+    coefficients = calibration.sensor.pupil.gather(
+        np.where(lit, np.nan_to_num(errors), 0)
+    ) @ calibration.modal_matrix(modes)
+    assert 0.6 < np.sqrt(np.mean((coefficients / calibration.sigma(estimate, photons, noise, modes)) ** 2)) < 1.6
 
 
-def test_command_calibrates_with_known_commands(files, command, found):
+def test_command_calibrates_with_known_commands(files, command, estimate):
     """Both pupils on one image, two exposures of each state, and a dark."""
     calibration, said = command
     assert "stage 4 of 4" in said
@@ -160,7 +160,7 @@ def test_command_calibrates_with_known_commands(files, command, found):
     assert calibration.n_averaged == 2
     summary = reconstruct(files / "unseen.npy", calibration, files / "phase.fits", photons=calibration.unit.mean())
     assert summary.n_flagged == 0
-    np.testing.assert_allclose(fits.getdata(files / "phase.fits"), found.phase, atol=0.05)
+    np.testing.assert_allclose(fits.getdata(files / "phase.fits"), estimate.phase, atol=0.05)
 
 
 KINDS = {
@@ -214,29 +214,29 @@ def test_states_that_do_not_belong_together_are_named(tmp_path, settings, messag
 @pytest.mark.slow
 def test_turned_pupil_of_a_telescope():
     """On all fully lit pixels, and next to no edge, where the error bars hold."""
-    taken = Recorded(12, 4, 0.5, aperture="VLT", pixels=40, side=52)
-    calibration = taken.calibration(n_steps=4, oversampling=2)
-    found = calibration(np.where(taken.bad, np.nan, taken.unseen))
-    assert np.count_nonzero(found.flags) <= 2  # the screens have finer modes than the commands
-    errors, lit = taken.errors(found.phase), taken.bench.fully_lit
+    recorded = Recorded(12, 4, 0.5, aperture="VLT", pixels=40, side=52)
+    calibration = recorded.calibration(n_steps=4, oversampling=2)
+    estimate = calibration(np.where(recorded.bad, np.nan, recorded.unseen))
+    assert np.count_nonzero(estimate.flags) <= 2  # the screens have finer modes than the commands
+    errors, lit = recorded.errors(estimate.phase), recorded.bench.fully_lit
     inner = ndimage.binary_erosion(lit)
     assert rms(errors, lit) < 0.02
     assert rms(errors, inner) < 0.012
-    photons, noise = calibration.unit.mean(), taken.bench.noise
-    points = errors / calibration.sigma(found, photons, noise)
+    photons, noise = calibration.unit.mean(), recorded.bench.noise
+    points = errors / calibration.sigma(estimate, photons, noise)
     assert 0.8 < rms(points, inner) < 1.3
     modes = zernike_basis(calibration.sensor.pupil, 50)
     # A mode also has values at pixels of the rim. There the true phase is unknown: its mean includes zeros.
-    dark = np.pad((taken.phases == 0).all(axis=0), 1, constant_values=True)
-    known = calibration.good & ~ndimage.binary_dilation(dark, np.ones((3, 3)))[1:-1, 1:-1]
-    errors = np.where(known, np.nan_to_num(errors - np.nanmean(errors[:, lit])), 0)
-    left = calibration.sensor.pupil.gather(errors) @ calibration.modal_matrix(modes)
-    ratio = left / calibration.sigma(found, photons, noise, modes)
+    dark = np.pad((recorded.phases == 0).all(axis=0), 1, constant_values=True)
+    certain = calibration.good & ~ndimage.binary_dilation(dark, np.ones((3, 3)))[1:-1, 1:-1]
+    errors = np.where(certain, np.nan_to_num(errors - np.nanmean(errors[:, lit])), 0)
+    coefficients = calibration.sensor.pupil.gather(errors) @ calibration.modal_matrix(modes)
+    ratio = coefficients / calibration.sigma(estimate, photons, noise, modes)
     assert 0.8 < np.median(np.sqrt(np.mean(ratio**2, axis=1))) < 1.3
 
 
-def test_linear_method_measures_small_screens_on_a_fitted_bench(taken, calibration):
-    bench = taken.bench
+def test_linear_method_measures_small_screens_on_a_fitted_bench(recorded, calibration):
+    bench = recorded.bench
     screen = bench.smooth(0.1, 1000)
     method = Linear(calibration.sensor, zernike_basis(calibration.sensor.pupil, 60))
     phase = calibration(wide(bench.counts(screen, (8, 0))), method=method).phase

@@ -17,40 +17,40 @@ from . import calibration_frames
 
 
 @pytest.fixture(scope="module")
-def taken():
+def recording():
     return study.Recording.read()
 
 
 @pytest.fixture(scope="module")
-def calibration(taken):
-    return study.calibrate(taken)
+def calibration(recording):
+    return study.calibrate(recording)
 
 
 @pytest.fixture(scope="module")
-def measured(taken, calibration):
-    return study.measure_inputs(taken, calibration, 0.3, 1)
+def measured(recording, calibration):
+    return study.measure_inputs(recording, calibration, 0.3, 1)
 
 
-def test_recorded_frames_are_those_that_the_script_makes(taken):
+def test_recorded_frames_are_those_that_the_script_makes(recording):
     assert calibration_frames.FILE.stat().st_size < 600e3
-    made = calibration_frames.made()
-    assert made.keys() == taken.arrays.keys()
-    for name, values in made.items():
-        assert values.dtype == taken.arrays[name].dtype
+    arrays = calibration_frames.made()
+    assert arrays.keys() == recording.arrays.keys()
+    for name, values in arrays.items():
+        assert values.dtype == recording.arrays[name].dtype
         # The last digits of the light depend on the processor: a draw may then differ by a count.
-        np.testing.assert_allclose(taken.arrays[name], values, rtol=0, atol=values.dtype == np.int16)
+        np.testing.assert_allclose(recording.arrays[name], values, rtol=0, atol=values.dtype == np.int16)
 
 
-def test_shorter_exposures_have_the_light_of_the_calibration_and_more_noise(taken):
-    (bright, *_), (faint, *_) = (taken.unseen(0.5, photons) for photons in taken.photons)
-    (light, noise), (same, more) = (taken.shot(number) for number in (bright, faint))
+def test_shorter_exposures_have_the_light_of_the_calibration_and_more_noise(recording):
+    (bright, *_), (faint, *_) = (recording.unseen(0.5, photons) for photons in recording.photons)
+    (light, noise), (same, more) = (recording.shot(number) for number in (bright, faint))
     assert same.sum() == pytest.approx(light.sum(), rel=0.05)  # of another screen
     assert np.median(more) > 10 * np.median(noise)
 
 
-def test_fit_recovers_the_bench(taken, calibration):
+def test_fit_recovers_the_bench(recording, calibration):
     fit = calibration.bench
-    for name, value in study.known_values(taken).items():
+    for name, value in study.known_values(recording).items():
         if name in ("diameter", "first", "second"):
             assert fit[name].value == pytest.approx(value, rel=5e-3), name
         elif name.endswith(("row", "column", "leakage")):
@@ -58,12 +58,12 @@ def test_fit_recovers_the_bench(taken, calibration):
     assert fit.consistent
 
 
-def test_saved_calibration_keeps_its_fit(tmp_path, taken, calibration):
+def test_saved_calibration_keeps_its_fit(tmp_path, recording, calibration):
     calibration.save(tmp_path / "bench.npz")
     loaded = Calibration.load(tmp_path / "bench.npz")
-    counts, noise = taken.shot(taken.unseen(0.3, taken.photons[0])[0])
-    found, expected = (one(counts, smooth=MapPrior(0.3, 4.0), noise=noise) for one in (loaded, calibration))
-    np.testing.assert_array_equal(found.phase, expected.phase)
+    counts, noise = recording.shot(recording.unseen(0.3, recording.photons[0])[0])
+    result, expected = (fit(counts, smooth=MapPrior(0.3, 4.0), noise=noise) for fit in (loaded, calibration))
+    np.testing.assert_array_equal(result.phase, expected.phase)
     assert loaded.bench.estimates == calibration.bench.estimates
     loaded.bench.save(tmp_path / "fit.fits")
     assert "MODEL SHAPE 0" not in fits.getheader(tmp_path / "fit.fits")
@@ -72,29 +72,29 @@ def test_saved_calibration_keeps_its_fit(tmp_path, taken, calibration):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("error", "consistent"), [(0.02, True), (0.03, False)])
-def test_verdict_shows_commands_that_are_wrong_by_three_percent(taken, error, consistent):
-    wrong = {**taken.arrays, "commands": (1 + error) * taken.arrays["commands"]}
-    assert study.calibrate(replace(taken, arrays=wrong)).bench.consistent == consistent
+def test_verdict_shows_commands_that_are_wrong_by_three_percent(recording, error, consistent):
+    wrong = {**recording.arrays, "commands": (1 + error) * recording.arrays["commands"]}
+    assert study.calibrate(replace(recording, arrays=wrong)).bench.consistent == consistent
 
 
 def test_calibrated_phases_are_better_than_those_of_the_design_and_their_error_bars_hold(measured):
     assert measured.rms.tolist() == [0.1, 0.3]
     assert np.all(measured.column("calibrated") < 0.75 * measured.column("plain"))
     assert measured.column("calibrated").max() < 0.02
-    for [one] in measured.measured:
-        assert 0.5 < one.inside < 0.9
-        assert one.consistent
+    for [screen] in measured.measured:
+        assert 0.5 < screen.inside < 0.9
+        assert screen.consistent
 
 
-def test_frames_of_a_different_bench_are_flagged(taken, calibration):
-    [number] = taken.unseen(0.3, taken.photons[0])[:1]
-    frames = taken.arrays["unseen_frames"].copy()
+def test_frames_of_a_different_bench_are_flagged(recording, calibration):
+    [number] = recording.unseen(0.3, recording.photons[0])[:1]
+    frames = recording.arrays["unseen_frames"].copy()
     frames[number, 1] = frames[number, 1, ::-1]
-    [[one]] = study.measure(
-        replace(taken, arrays={**taken.arrays, "unseen_frames": frames}), calibration, [[number]]
+    [[screen]] = study.measure(
+        replace(recording, arrays={**recording.arrays, "unseen_frames": frames}), calibration, [[number]]
     )
-    assert not one.consistent
-    assert one.misfit > 10
+    assert not screen.consistent
+    assert screen.misfit > 10
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
@@ -122,8 +122,8 @@ def test_three_pokes_place_the_mirror_on_the_camera(tmp_path, monkeypatch, mirro
     strokes = 40 * np.sin(actuators[:, 0] / 3) * np.cos(actuators[:, 1] / 4)
     np.save("strokes.npy", np.stack([0 * strokes, strokes]))
     exec(code, {"read": read, "np": np, "side": side})
-    flat, found = np.load("commands.npy")
+    flat, shaped = np.load("commands.npy")
     true = opd_to_phase(2 * np.tensordot(strokes, influence, 1), 635.0)
-    error = (found - true)[pupil.inside].std() / true[pupil.inside].std()
+    error = (shaped - true)[pupil.inside].std() / true[pupil.inside].std()
     assert not flat.any()
     assert error > 0.5 if mirrored else error < 0.05

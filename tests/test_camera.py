@@ -52,11 +52,11 @@ def test_nan_dark_and_bad_pixel_map(tmp_path):
     marked[7, 8] = 1
     dark = np.full(FRAME.shape, 10.0)
     dark[9, 9] = np.nan
-    frame, lightless, map_ = (write(tmp_path / f"{k}.fits", one) for k, one in enumerate((counts, dark, marked)))
-    (found,), _, _ = camera.read_all([frame], [frame], [lightless], [map_], saturation=1e5)
-    assert np.argwhere(found.bad).tolist() == [[3, 4], [5, 6], [7, 8], [9, 9]]
-    assert np.isfinite(found.counts).all()
-    assert found.counts[0, 5] == FRAME[0, 5] - 10
+    frame, lightless, map_ = (write(tmp_path / f"{k}.fits", data) for k, data in enumerate((counts, dark, marked)))
+    (image,), _, _ = camera.read_all([frame], [frame], [lightless], [map_], saturation=1e5)
+    assert np.argwhere(image.bad).tolist() == [[3, 4], [5, 6], [7, 8], [9, 9]]
+    assert np.isfinite(image.counts).all()
+    assert image.counts[0, 5] == FRAME[0, 5] - 10
 
 
 @pytest.mark.parametrize(
@@ -72,8 +72,8 @@ def test_nan_dark_and_bad_pixel_map(tmp_path):
 def test_saturation_is_given_in_the_header_of_the_type_or_seen(tmp_path, counts, settings, level):
     cards = {key: value for key, value in settings.items() if key.isupper()}
     path = write(tmp_path / "a.fits", counts, **cards)
-    (found,), _, _ = camera.read_all([path], [path], saturation=settings.get("saturation"))
-    np.testing.assert_array_equal(found.bad, counts >= level)
+    (image,), _, _ = camera.read_all([path], [path], saturation=settings.get("saturation"))
+    np.testing.assert_array_equal(image.bad, counts >= level)
 
 
 @pytest.mark.parametrize(
@@ -164,8 +164,8 @@ def test_exposures_are_averaged_and_images_are_kept_apart(tmp_path, light, kind)
     paths = [write(tmp_path / f"{index}.fits", image) for index, image in enumerate(written)]
     stated = {"n_images": 2} if kind == "stated pair" else {}
     frames, clear, sources = camera.read_all(paths, paths, saturation=1e5, **stated)
-    for found in (frames, clear):
-        np.testing.assert_allclose([image.counts for image in found], light[:images])
+    for averaged in (frames, clear):
+        np.testing.assert_allclose([image.counts for image in averaged], light[:images])
     assert len(sources) == 2 * len(paths)
 
 
@@ -202,9 +202,9 @@ def test_each_kind_of_frame_has_its_own_dark(tmp_path, kind):
         write(tmp_path / "dark1.fits", 0 * FRAME + 10.0, **others),
         write(tmp_path / "dark2.fits", np.stack([0 * image + 99.0, 0 * image + 101]), **cards),
     ]
-    given = [[darks[1]], darks[:1]] if kind == "stated" else [darks, ()]
-    found, clear, _ = camera.read_all([frame], [pupils], given[0], pupil_dark_files=given[1])
-    np.testing.assert_allclose(found[0].counts, image)
+    dark_files = [[darks[1]], darks[:1]] if kind == "stated" else [darks, ()]
+    frames, clear, _ = camera.read_all([frame], [pupils], dark_files[0], pupil_dark_files=dark_files[1])
+    np.testing.assert_allclose(frames[0].counts, image)
     np.testing.assert_allclose(clear[0].counts, FRAME)
 
 
@@ -215,7 +215,7 @@ def test_dark_that_does_not_fit_is_named(tmp_path):
         camera.read_all([frame], [frame], [dark])
     noise = np.random.default_rng(1).normal(0, 2, (3, *FRAME.shape))
     noise[2] += 50
-    darks = [write(tmp_path / f"dark{index}.fits", one) for index, one in enumerate(noise)]
+    darks = [write(tmp_path / f"dark{index}.fits", counts) for index, counts in enumerate(noise)]
     camera.read_all([frame], [frame], darks[:2])
     with pytest.raises(ValueError, match=r"dark2\.fits has .* counts more than dark0\.fits.*pupil_dark_files"):
         camera.read_all([frame], [frame], [darks[0], darks[2]])
@@ -251,8 +251,8 @@ def test_compressed_images_are_read(tmp_path, dtype, algorithm):
     level = {"quantize_level": 0.0} if dtype == np.float32 else {}
     unit = fits.CompImageHDU(image, compression_type="GZIP_2" if level else algorithm, **level)
     fits.HDUList([fits.PrimaryHDU(), unit]).writeto(tmp_path / "a.fits")
-    found = camera.read(tmp_path / "a.fits")
-    np.testing.assert_array_equal(found.images[0], image)
+    camera_file = camera.read(tmp_path / "a.fits")
+    np.testing.assert_array_equal(camera_file.images[0], image)
 
 
 def _tile(packed, n=20):

@@ -38,9 +38,9 @@ def test_fine_phase_has_the_means_of_the_pixels():
 def test_fine_phase_of_a_parabola_is_its_value_and_not_its_mean():
     y, x = np.mgrid[:40, :40] - 19.5
     fine_y, fine_x = (np.mgrid[:80, :80] + 0.5) / 2 - 20
-    found = fine_phase(0.01 * (x**2 + x * y) + 0.01 / 12, 2)
+    fine = fine_phase(0.01 * (x**2 + x * y) + 0.01 / 12, 2)
     inner = (slice(30, 50),) * 2
-    np.testing.assert_allclose(found[inner], 0.01 * (fine_x**2 + fine_x * fine_y)[inner], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(fine[inner], 0.01 * (fine_x**2 + fine_x * fine_y)[inner], rtol=0, atol=1e-5)
 
 
 def test_unwrapped_phase_has_no_jump():
@@ -48,8 +48,8 @@ def test_unwrapped_phase_has_no_jump():
     true = 60 * ndimage.gaussian_filter(np.random.default_rng(2).normal(size=(40, 40)), 5)
     true[~inside] = 0
     assert np.ptp(true[inside]) > 3 * np.pi
-    left = (unwrapped(np.angle(np.exp(1j * true)), inside) - true)[inside]
-    assert np.ptp(left) < 1e-9
+    residual = (unwrapped(np.angle(np.exp(1j * true)), inside) - true)[inside]
+    assert np.ptp(residual) < 1e-9
 
 
 @pytest.fixture(scope="module")
@@ -129,10 +129,10 @@ def test_sharp_light_divides_pixels_as_the_edge_does(center, radius):
     y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k
     disc = (np.hypot(y - center[0], x - center[1]) < radius).astype(float)
     pixels, true = blocks(disc, k), blocks(disc, k // f)
-    found = Light.sharp(pixels, f).start
-    np.testing.assert_allclose(blocks(found, f), pixels, atol=1e-9)
+    light = Light.sharp(pixels, f).start
+    np.testing.assert_allclose(blocks(light, f), pixels, atol=1e-9)
     even = np.kron(pixels, np.ones((f, f)))
-    assert np.sum((found - true) ** 2) < np.sum((even - true) ** 2) / 50
+    assert np.sum((light - true) ** 2) < np.sum((even - true) ** 2) / 50
 
 
 def test_light_of_vanes_that_does_not_interfere_has_no_bias():
@@ -145,8 +145,8 @@ def test_light_of_vanes_that_does_not_interfere_has_no_bias():
         across = np.cos(turn) * y + np.sin(turn) * x - place
         lit = ((np.hypot(y, x) < 9) & (np.abs(across) > width / 2)).astype(float)
         pixels, true = blocks(lit, k), blocks(lit, k // f)
-        found, even = Light.sharp(pixels, f).start, np.kron(pixels, np.ones((f, f)))
-        right, *others = (np.sum(one * (1 - one)) for one in (true, found, even))
+        sharp, even = Light.sharp(pixels, f).start, np.kron(pixels, np.ones((f, f)))
+        right, *others = (np.sum(share * (1 - share)) for share in (true, sharp, even))
         ratios.append(others[0] / right)
         control.append(others[1] / right)
     assert abs(np.mean(ratios) - 1) < 0.05
@@ -169,12 +169,12 @@ def test_known_phases_go_on_beyond_an_outline_that_cuts_pixels():
     y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
     true = np.stack([0.002 * (x**2 - 2 * x * y), 0.05 * x + 0.003 * y**2])
     lit = np.hypot(y, x) < 14.3
-    phases = np.stack([blocks(one * lit, k) for one in true])
+    phases = np.stack([blocks(phase * lit, k) for phase in true])
     frames = np.ones((2, 2, n, n))
-    known = Recording.of(frames, frames[0], phases, 28.6, 1.0, 1.0).phases[:, PAD:-PAD, PAD:-PAD]
+    extended = Recording.of(frames, frames[0], phases, 28.6, 1.0, 1.0).phases[:, PAD:-PAD, PAD:-PAD]
     touched = blocks(lit.astype(float), k) > 0
     np.testing.assert_allclose(
-        known[:, touched], np.stack([blocks(one, k) for one in true])[:, touched], atol=1e-6
+        extended[:, touched], np.stack([blocks(phase, k) for phase in true])[:, touched], atol=1e-6
     )
 
 
@@ -245,7 +245,7 @@ def test_other_values_replace_those_of_a_fit_and_explain_its_frames_worse():
     assert (wrong["diameter"].value, wrong["leakage"].value) == (1.06, 0.0)
     assert wrong["first"] == fit["first"]
     recorded = BENCH.recording(seed=1)[0][0]
-    misfit, worse = (np.sum((FittedSensor(one).frames(one.flat) - recorded) ** 2) for one in (fit, wrong))
+    misfit, worse = (np.sum((FittedSensor(bench).frames(bench.flat) - recorded) ** 2) for bench in (fit, wrong))
     assert worse > 2 * misfit
     with pytest.raises(ValueError, match="values = 'size': expected one of"):
         fit.replaced({"size": 1.0})
@@ -268,11 +268,11 @@ def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated
     bench, calibration = calibrated
     screen = bench.smooth(rms, seed=1)
     counts = bench.counts(screen, (7, 1))
-    found = calibration(counts, smooth=True)
+    estimate = calibration(counts, smooth=True)
     asked = BEFORE["VLT" if bench is TURNED else "disc"]["plain"][number] / 2
-    assert bench.error(found, screen) < (min(0.02, asked) if rms <= 0.8 else asked)
-    left = (found - bench.on_pupil(screen + bench.flat))[bench.fully_lit]
-    pull = (left - left.mean()) / found.sigma[bench.fully_lit]
+    assert bench.error(estimate, screen) < (min(0.02, asked) if rms <= 0.8 else asked)
+    residual = (estimate - bench.on_pupil(screen + bench.flat))[bench.fully_lit]
+    pull = (residual - residual.mean()) / estimate.sigma[bench.fully_lit]
     assert 0.5 < pull.std() < 2
 
 
@@ -286,10 +286,10 @@ def test_smooth_phase_of_a_whole_camera_image_is_that_of_its_windows():
     counts[1, 20, 30] = np.nan
     [image] = windows.on_camera(counts[np.newaxis])[0] + 50
     [prior] = calibration(counts, smooth=True).priors
-    found, expected = whole(image, smooth=prior), calibration(counts, smooth=prior)
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6)
-    assert found.flags == expected.flags == Flag.BAD_PIXELS
-    assert not np.isnan(found.phase[calibration.good]).any()
+    estimate, expected = whole(image, smooth=prior), calibration(counts, smooth=prior)
+    np.testing.assert_allclose(estimate, expected, rtol=0, atol=1e-6)
+    assert estimate.flags == expected.flags == Flag.BAD_PIXELS
+    assert not np.isnan(estimate.phase[calibration.good]).any()
     lost = whole(0 * image + np.nan, smooth=prior)
     assert lost.flags & Flag.LOST
     assert np.isnan(lost.phase).all()
@@ -310,11 +310,11 @@ def test_evidence_chooses_a_prior_as_smooth_as_the_phase(monkeypatch):
         return fitted(bench)(counts, smooth=True)
 
     smooth = bench.smooth(0.3, seed=1)
-    found = measured(smooth)
-    assert found.priors[0].exponent > measured(segments(bench, 0.3)).priors[0].exponent
+    estimate = measured(smooth)
+    assert estimate.priors[0].exponent > measured(segments(bench, 0.3)).priors[0].exponent
     # Control: a prior for rough phases amplifies the noise of the highest frequencies.
     monkeypatch.setattr("zwfs.frames._fitted._EXPONENTS", (3.0,))
-    assert bench.error(measured(smooth), smooth) > 1.5 * bench.error(found, smooth)
+    assert bench.error(measured(smooth), smooth) > 1.5 * bench.error(estimate, smooth)
 
 
 @pytest.mark.slow

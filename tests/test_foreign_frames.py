@@ -31,9 +31,9 @@ def recorded(bench):
     return bench.images(screen, 1), bench.images(0 * screen, 2, masked=False)
 
 
-def difference(bench, found):
+def difference(bench, estimate):
     """Measured phase less the true one, radian."""
-    return bench.difference(found.phase, found.measurement.registered.corner, bench.smooth(0.5, seed=1))
+    return bench.difference(estimate.phase, estimate.measurement.registered.corner, bench.smooth(0.5, seed=1))
 
 
 @pytest.fixture(scope="module", params=CASES)
@@ -55,9 +55,9 @@ def test_phase_is_recovered_however_the_second_image_stands(case):
 def test_placement_of_the_second_image_is_measured_within_its_errors(case):
     bench, registered = case
     placement = registered.placement
-    found = [*placement.shift, placement.rotation, placement.magnification]
+    measured = [*placement.shift, placement.rotation, placement.magnification]
     true = [*bench.offsets[1], bench.rotations[1], bench.magnifications[1]]
-    assert np.all(np.abs(np.subtract(found, true)) < 4 * placement.sigma)
+    assert np.all(np.abs(np.subtract(measured, true)) < 4 * placement.sigma)
     assert np.all(placement.sigma < [0.02, 0.02, 0.05, 5e-4])
 
 
@@ -85,12 +85,12 @@ def test_bad_pixel_of_the_second_image_spoils_the_points_around_its_place():
 
 
 def test_noise_explains_the_frames_and_its_error_bar_holds(case):
-    found = recover_phase(reduce_frames(case[1], Optics()))
-    verdict = judge(found, NOISE)
+    estimate = recover_phase(reduce_frames(case[1], Optics()))
+    verdict = judge(estimate, NOISE)
     assert verdict.explained
     assert np.all(verdict.score > verdict.control + 0.5)
-    far = found.measurement.good & ~near_edges(found.measurement)
-    pulls = (difference(case[0], found) / verdict.sigma)[far]
+    far = estimate.measurement.good & ~near_edges(estimate.measurement)
+    pulls = (difference(case[0], estimate) / verdict.sigma)[far]
     assert 0.8 < pulls.std() < 1.4
 
 
@@ -110,7 +110,7 @@ def test_frames_that_do_not_belong_together_score_like_the_control(ideal):
 
 
 @pytest.mark.parametrize(
-    ("aperture", "given", "least"),
+    ("aperture", "diameter_known", "least"),
     [
         ("LUVOIR", False, 0.02),
         ("LUVOIR", True, 0.009),
@@ -120,15 +120,15 @@ def test_frames_that_do_not_belong_together_score_like_the_control(ideal):
         pytest.param("Keck", True, 0.009, marks=pytest.mark.slow),
     ],
 )
-def test_pupils_with_many_edges_are_measured(aperture, given, least):
+def test_pupils_with_many_edges_are_measured(aperture, diameter_known, least):
     """The circle lies around all segments, and a pixel that is lit in part has two areas."""
     bench = HcipyBench(aperture)
-    settings = {"pupil_diameter": float(bench.pixels)} if given else {}
+    settings = {"pupil_diameter": float(bench.pixels)} if diameter_known else {}
     registered = register_frames(*recorded(bench), **settings)
     assert registered.diameter == pytest.approx(bench.pixels, rel=0.025)
-    left = difference(bench, recover_phase(reduce_frames(registered, Optics())))
-    assert np.count_nonzero(np.isfinite(left)) > 0.98 * np.count_nonzero(bench.fully_lit)
-    assert np.nanstd(left) < least
+    errors = difference(bench, recover_phase(reduce_frames(registered, Optics())))
+    assert np.count_nonzero(np.isfinite(errors)) > 0.98 * np.count_nonzero(bench.fully_lit)
+    assert np.nanstd(errors) < least
 
 
 # One mask, one image
@@ -149,9 +149,9 @@ def single_error(single, phase, corner):
 
 
 def test_one_image_gives_the_phase_and_no_verdict(single):
-    found = phase_of(*single[2:], phase_shifts=(np.pi / 2,))
-    assert single_error(single, found.phase, found.measurement.registered.corner) < 0.015  # 1.5 nm
-    verdict = judge(found, NOISE)
+    estimate = phase_of(*single[2:], phase_shifts=(np.pi / 2,))
+    assert single_error(single, estimate.phase, estimate.measurement.registered.corner) < 0.015  # 1.5 nm
+    verdict = judge(estimate, NOISE)
     assert verdict.explained is None
     assert np.isnan(verdict.score).all()
     assert "one image" in verdict.findings["fit"]
@@ -174,8 +174,8 @@ def test_one_image_takes_the_road_of_two(single, tmp_path, monkeypatch):
         ("cube", np.stack([single[2], 0.1 * single[2]])),
     ):
         np.save(f"{name}.npy", image)
-    known = ["--phase-shifts", "1.5708", "--diameter", "1.06"]
-    assert main(["calibrate", "one.npz", "--frames", "frame.npy", "--pupils", "clear.npy", *known]) == 0
+    options = ["--phase-shifts", "1.5708", "--diameter", "1.06"]
+    assert main(["calibrate", "one.npz", "--frames", "frame.npy", "--pupils", "clear.npy", *options]) == 0
     assert main(["reconstruct", "cube.npy", "--calibration", "one.npz", "-o", "phase.fits", "--quiet"]) == 0
     phases, header = fits.getdata("phase.fits"), fits.getheader("phase.fits")
     corner = header["CROPROW"], header["CROPCOL"]
@@ -185,7 +185,7 @@ def test_one_image_takes_the_road_of_two(single, tmp_path, monkeypatch):
 
 
 def test_one_image_cannot_test_a_fit(single):
-    images = [[Image(one, np.zeros(one.shape, bool))] for one in single[2:]]
+    images = [[Image(counts, np.zeros(counts.shape, bool))] for counts in single[2:]]
     optics = Optics(1.06, (np.pi / 2,))
     assert steps(*images, optics, ["scale"])[-1].name == "no fit: one image cannot test it"
     with pytest.raises(ValueError, match="expected none with one image"):

@@ -47,7 +47,7 @@ def pair(phase=None, dark=500.0, flux=(1.0, 0.8), gap=0.03):
     bare = np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2)
     both = []
     for images in (masked, bare):
-        images = [ndimage.gaussian_filter(one, 0.7) * part for one, part in zip(images, flux, strict=True)]
+        images = [ndimage.gaussian_filter(frame, 0.7) * part for frame, part in zip(images, flux, strict=True)]
         images[1] = shifted(images[1], SHIFT)
         both.append(np.hstack(images) * COUNTS + dark)
     return pupil, *both
@@ -63,19 +63,19 @@ def recorded(screen):
     return pair(screen)
 
 
-def on_grid(found, registered):
+def on_grid(estimate, registered):
     """The phase on the grid of `pair`."""
     canvas = np.full(registered.clear_frames[0].counts.shape, np.nan)
     row, column = registered.corner
     n = registered.n_pixels
-    canvas[row : row + n, column : column + n] = found.phase
+    canvas[row : row + n, column : column + n] = estimate.phase
     return canvas[MARGIN : MARGIN + D, MARGIN : MARGIN + D]
 
 
-def error(found, registered, truth):
-    phase = on_grid(found, registered)
-    left = np.exp(1j * (phase - truth)[np.isfinite(phase)])
-    return np.sqrt(np.mean(np.angle(left * np.conj(left.mean())) ** 2))
+def error(estimate, registered, truth):
+    phase = on_grid(estimate, registered)
+    waves = np.exp(1j * (phase - truth)[np.isfinite(phase)])
+    return np.sqrt(np.mean(np.angle(waves * np.conj(waves.mean())) ** 2))
 
 
 # Registration
@@ -87,8 +87,8 @@ def test_register_finds_a_known_shift(shift):
     reference = ndimage.gaussian_filter(np.pad((segments > 0).astype(float), 10), 1.0)
     noise = np.random.default_rng(1).normal(0, 0.02, (2, *reference.shape))
     inside = np.hypot(*(np.mgrid[:120, :120] - 59.5)) < 45
-    found = register(shifted(reference, shift) + noise[0], reference + noise[1], inside)
-    np.testing.assert_allclose(found.shift, shift, atol=0.03)
+    placement = register(shifted(reference, shift) + noise[0], reference + noise[1], inside)
+    np.testing.assert_allclose(placement.shift, shift, atol=0.03)
 
 
 def test_register_refuses_a_shift_out_of_reach():
@@ -127,13 +127,13 @@ def test_cropped_mask_out_images_are_found_on_the_frames():
 
 def test_stacked_pupils_and_given_centers(recorded):
     _, masked, bare = recorded
-    turned = [image(np.vstack(np.hsplit(one, 2))) for one in (masked, bare)]
+    turned = [image(np.vstack(np.hsplit(frame, 2))) for frame in (masked, bare)]
     registered = register_frames(turned[:1], turned[1:])
     np.testing.assert_allclose(registered.origins[1], [92 + SHIFT[0], SHIFT[1]], atol=0.1)
-    given = register_frames(
+    centred = register_frames(
         [image(masked)], [image(bare)], pupil_centers=[[45.5, 45.5], [46, 137]], pupil_diameter=D
     )
-    np.testing.assert_allclose(given.origins[1], SECOND, atol=0.1)
+    np.testing.assert_allclose(centred.origins[1], SECOND, atol=0.1)
 
 
 # Measurement
@@ -142,12 +142,12 @@ def test_stacked_pupils_and_given_centers(recorded):
 def test_phase_is_recovered(recorded, screen):
     _, masked, bare = recorded
     registered = register_frames([image(masked)], [image(bare)])
-    found = recover_phase(reduce_frames(registered, Optics()))
+    phases = recover_phase(reduce_frames(registered, Optics()))
     # Blur and interpolation, which the model knows nothing of, leave most of it, at the gaps.
-    assert error(found, registered, screen) < 0.1
-    assert found.agreement.correlation.min() > 0.97
+    assert error(phases, registered, screen) < 0.1
+    assert phases.agreement.correlation.min() > 0.97
     worse = register_frames([image(masked)], [image(bare)], subpixel=False)
-    assert error(recover_phase(reduce_frames(worse, Optics())), worse, screen) > error(found, registered, screen)
+    assert error(recover_phase(reduce_frames(worse, Optics())), worse, screen) > error(phases, registered, screen)
 
 
 def test_background_and_flux_are_measured(recorded):
@@ -175,12 +175,12 @@ def test_arms_that_are_lit_differently_hardly_change_the_phase(screen):
 def test_hot_and_dead_pixels_without_a_map_are_found(screen):
     _, *clean = pair(screen)
     rng = np.random.default_rng(8)
-    noisy = [rng.normal(one, 100.0) for one in clean]
+    noisy = [rng.normal(frame, 100.0) for frame in clean]
     lit = np.flatnonzero(ndimage.binary_erosion(clean[1] > 0.5 * COUNTS, iterations=2))
     hot, dead = rng.choice(lit, (2, 30), replace=False)
-    for one in noisy:
-        one.flat[hot] += COUNTS
-        one.flat[dead] = 500
+    for frame in noisy:
+        frame.flat[hot] += COUNTS
+        frame.flat[dead] = 500
     registered = register_frames([image(noisy[0])], [image(noisy[1])])
     bad = registered.frames[0].bad
     assert bad.flat[hot].mean() > 0.9
@@ -206,11 +206,11 @@ def test_exchanged_phase_shifts_change_the_sign(recorded):
     _, masked, bare = recorded
     registered = register_frames([image(masked)], [image(bare)])
     optics = Optics()
-    found = recover_phase(reduce_frames(registered, optics))
+    estimate = recover_phase(reduce_frames(registered, optics))
     swapped = replace(optics, phase_shifts=optics.phase_shifts[::-1])
-    other = recover_phase(reduce_frames(registered, swapped))
-    np.testing.assert_allclose(np.nan_to_num(other.phase), -np.nan_to_num(found.phase), atol=1e-5)
-    np.testing.assert_allclose(other.agreement.correlation, found.agreement.correlation, atol=1e-6)
+    exchanged = recover_phase(reduce_frames(registered, swapped))
+    np.testing.assert_allclose(np.nan_to_num(exchanged.phase), -np.nan_to_num(estimate.phase), atol=1e-5)
+    np.testing.assert_allclose(exchanged.agreement.correlation, estimate.agreement.correlation, atol=1e-6)
 
 
 def test_masked_pixels_are_left_out_and_do_little_harm(recorded, screen):
@@ -220,13 +220,13 @@ def test_masked_pixels_are_left_out_and_do_little_harm(recorded, screen):
     spoilt = np.where(bad, 0.0, masked)
     registered = register_frames([image(spoilt, bad=bad)], [image(bare)])
     measurement = reduce_frames(registered, Optics())
-    found = recover_phase(measurement)
+    estimate = recover_phase(measurement)
     # Each one spoils up to four points of the grid, in one image or the other.
     assert 60 < measurement.n_bad < 500
-    assert np.count_nonzero(np.isfinite(found.phase)) == measurement.pupil.n_points - measurement.n_bad
+    assert np.count_nonzero(np.isfinite(estimate.phase)) == measurement.pupil.n_points - measurement.n_bad
     clean = register_frames([image(masked)], [image(bare)])
     best = error(recover_phase(reduce_frames(clean, Optics())), clean, screen)
-    assert error(found, registered, screen) < best + 0.02
+    assert error(estimate, registered, screen) < best + 0.02
 
 
 def test_leakage_and_unmasked_light_are_undone(screen):
@@ -237,9 +237,9 @@ def test_leakage_and_unmasked_light_are_undone(screen):
     bare = np.stack([np.pad(pupil.amplitude**2, MARGIN)] * 2)
     mixed = 0.8 * (0.9 * ideal + 0.1 * ideal[::-1]) + 0.2 * bare
     registered = register_frames([image(np.hstack(mixed))], [image(np.hstack(bare))], subpixel=False, **EXACT)
-    found = recover_phase(reduce_frames(registered, optics), 100)
-    assert error(found, registered, screen) < 1e-3
-    np.testing.assert_allclose(found.agreement.correlation, 1, atol=1e-5)
+    estimate = recover_phase(reduce_frames(registered, optics), 100)
+    assert error(estimate, registered, screen) < 1e-3
+    np.testing.assert_allclose(estimate.agreement.correlation, 1, atol=1e-5)
     plain = Optics()
     assert error(recover_phase(reduce_frames(registered, plain), 100), registered, screen) > 0.03
 
@@ -278,10 +278,10 @@ def test_fit_finds_the_diameter_and_the_scale(screen):
 def test_fit_leaves_a_clear_image_where_registration_is_sure_of_it(recorded):
     _, masked, bare = recorded
     registered = register_frames([image(masked)], [image(bare)])
-    found, optics = fit(registered, Optics(scale=1.2), ["registration", "scale"], n_steps=3)
+    refined, optics = fit(registered, Optics(scale=1.2), ["registration", "scale"], n_steps=3)
     assert optics.scale == pytest.approx(1, abs=0.05)
-    assert not np.array_equal(found.origins[:2], registered.origins[:2])
-    np.testing.assert_array_equal(found.origins[2:], registered.origins[2:])
+    assert not np.array_equal(refined.origins[:2], registered.origins[:2])
+    np.testing.assert_array_equal(refined.origins[2:], registered.origins[2:])
 
 
 def test_prediction_tells_a_pair_from_a_mere_juxtaposition(recorded):
@@ -316,7 +316,7 @@ def poked_pair(screen, height):
 @pytest.mark.parametrize("height", [0.4, -0.4])
 def test_order_of_the_images_follows_from_a_poke(screen, height):
     right = poked_pair(screen, height)
-    wrong = [replace(one, optics=Optics(phase_shifts=(-np.pi / 2, np.pi / 2))) for one in right]
+    wrong = [replace(measurement, optics=Optics(phase_shifts=(-np.pi / 2, np.pi / 2))) for measurement in right]
     for measured, exchanged in ((right, False), (wrong, True)):
         order = order_of_images(*measured, sign=int(np.sign(height)))
         assert order.exchanged == exchanged
@@ -423,16 +423,16 @@ def test_bench_writes_what_the_pipeline_reads(tmp_path):
     registered = register_frames(frames, clear_frames)
     # The bench sets the images half a pixel apart.
     np.testing.assert_allclose(registered.origins[3], [-0.5, 89.5], atol=0.1)
-    found = recover_phase(reduce_frames(registered, Optics()))
-    error = bench_error(bench, commanded, found)
+    estimate = recover_phase(reduce_frames(registered, Optics()))
+    error = bench_error(bench, commanded, estimate)
     model = BenchModel.from_images(bench, 1)
-    known = PhaseShifted(model.shifted)(model.normalise(bench.frames(commanded, 1))).phase
+    informed = PhaseShifted(model.shifted)(model.normalise(bench.frames(commanded, 1))).phase
     # As good as one who knows where the pupils stand.
-    assert error < segment_residual(model.pistons(known), commanded).std() + 0.03 < 0.18
+    assert error < segment_residual(model.pistons(informed), commanded).std() + 0.03 < 0.18
     written = write_bench(tmp_path, bench, seed=2)
     flat = camera.read_all([written["frame"]], [written["pupils"]], [written["dark"]])[:2]
     flat = recover_phase(reduce_frames(register_frames(*flat), Optics()))
-    assert bench_error(bench, commanded, found, flat) < 0.7 * error
+    assert bench_error(bench, commanded, estimate, flat) < 0.7 * error
 
 
 def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
@@ -443,32 +443,32 @@ def test_phase_file_says_where_it_comes_from(tmp_path, recorded):
     bad[40, 50] = True
     registered = register_frames([image(masked, bad=bad)], [image(bare)])
     optics = Optics(diameter=1.1)
-    found = recover_phase(reduce_frames(registered, optics))
+    estimate = recover_phase(reduce_frames(registered, optics))
     source = camera.CameraFile(masked[np.newaxis], "frame.fits", "ab" * 32, {"DATE-OBS": "2023-05-01"})
     for name in ("a.fits", "b.fits"):
-        camera.write_phase(tmp_path / name, found, 635.0, [source])
+        camera.write_phase(tmp_path / name, estimate, 635.0, [source])
     assert (tmp_path / "a.fits").read_bytes() == (tmp_path / "b.fits").read_bytes()
     with fits.open(tmp_path / "a.fits") as units:
         units.verify("exception")
         header = units[0].header
-        np.testing.assert_array_equal(units[0].data, found.phase)
-        np.testing.assert_allclose(units["PHASE_NM"].data, found.phase * 635 / (2 * np.pi), rtol=1e-6)
-        assert units["BAD"].data.sum() == found.measurement.n_bad == header["NBAD"] > 0
+        np.testing.assert_array_equal(units[0].data, estimate.phase)
+        np.testing.assert_allclose(units["PHASE_NM"].data, estimate.phase * 635 / (2 * np.pi), rtol=1e-6)
+        assert units["BAD"].data.sum() == estimate.measurement.n_bad == header["NBAD"] > 0
         assert (header["BUNIT"], units["PHASE_NM"].header["BUNIT"]) == ("rad", "nm")
         assert (header["WAVELEN"], header["DIMPLE"]) == (635, 1.1)
-        assert [header[f"CORR{i}"] for i in (1, 2)] == pytest.approx([*found.agreement.correlation])
-        left, right = (np.split(frame - 500, 2, axis=1) for frame in (masked, bare))
-        light = [first.sum() / second.sum() for first, second in (left, right)]
+        assert [header[f"CORR{i}"] for i in (1, 2)] == pytest.approx([*estimate.agreement.correlation])
+        masked_halves, bare_halves = (np.split(frame - 500, 2, axis=1) for frame in (masked, bare))
+        light = [first.sum() / second.sum() for first, second in (masked_halves, bare_halves)]
         assert [header["FLUXMASK"], header["FLUXOUT"]] == pytest.approx(light, rel=0.02)
         assert [header["ROW2"] - header["ROW1"], header["COL2"] - header["COL1"]] == pytest.approx(SECOND, abs=0.1)
         assert (header["FILE1"], header["SHA1"], header["DATE-OBS"]) == ("frame.fits", "ab" * 32, "2023-05-01")
         assert header["CREATOR"].startswith("zwfs ")
     with pytest.raises(ValueError, match="wavelength = 0"):
-        camera.write_phase(tmp_path / "c.fits", found, 0)
+        camera.write_phase(tmp_path / "c.fits", estimate, 0)
     assert not (tmp_path / "c.fits").exists()
     (tmp_path / "mine.fits").write_text("precious")
     with pytest.raises(ValueError, match=r"mine\.fits' exists and is not a phase map"):
-        camera.write_phase(tmp_path / "mine.fits", found, 635.0)
+        camera.write_phase(tmp_path / "mine.fits", estimate, 635.0)
 
 
 # The real bench
@@ -501,9 +501,9 @@ def test_seal_frames_are_explained(seal_work):
     named = {step.name: step.result for step in seal_work}
     # Already the light of the two frames, balanced, and nothing fitted.
     assert named["balance of the flux"].agreement.correlation == pytest.approx([0.83, 0.90], abs=0.02)
-    left, right = seal_work[-1].result.agreement.correlation
-    assert left > 0.87
-    assert right > 0.91
+    first, second = seal_work[-1].result.agreement.correlation
+    assert first > 0.87
+    assert second > 0.91
     assert seal_work[-1].result.measurement.n_bad == 0
     # One frame predicts the other one far better than the outlines alone let it.
     assert np.all(seal_work[-1].predicted > seal_work[0].predicted + 0.05)
@@ -530,10 +530,10 @@ def test_seal_frames_that_do_not_belong_together_are_refused(seal, seal_steps):
 def test_first_look_is_that_of_the_single_steps():
     bench = Bench(n_pixels=40)
     frames, clear = bench.frames(), bench.clear_frames()
-    found = phase_of(frames + 100, clear + 100, np.full(clear[0].shape, 100.0))
-    images = ([Image(one, np.zeros(one.shape, bool)) for one in pair] for pair in (frames, clear))
+    estimate = phase_of(frames + 100, clear + 100, np.full(clear[0].shape, 100.0))
+    images = ([Image(counts, np.zeros(counts.shape, bool)) for counts in pair] for pair in (frames, clear))
     expected = recover_phase(reduce_frames(register_frames(*images), Optics()))
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(estimate, expected, rtol=0, atol=1e-5)
     np.testing.assert_array_equal(phase_of(frames, clear), expected)
     np.testing.assert_array_equal(Calibration.from_arrays(frames, clear)(frames), expected)
 

@@ -46,14 +46,14 @@ def npy(image, version=(1, 0)):
 
 def fits_file(units, **cards):
     """A FITS file whose units are an image, raw numbers with cards that scale them, or nothing."""
-    made = fits.HDUList()
+    hdus = fits.HDUList()
     for image in units:
-        made.append(fits.ImageHDU(image) if made else fits.PrimaryHDU(image))
-    made[-1].header.update({"EXPTIME": 0.5, "DIMPLE": 1.06, "THETA1": np.pi / 2, "THETA2": -np.pi / 2})
-    for unit in made:
+        hdus.append(fits.ImageHDU(image) if hdus else fits.PrimaryHDU(image))
+    hdus[-1].header.update({"EXPTIME": 0.5, "DIMPLE": 1.06, "THETA1": np.pi / 2, "THETA2": -np.pi / 2})
+    for unit in hdus:
         unit.add_checksum(when="then")  # by default the time, which no example repeats
     stream = io.BytesIO()
-    made.writeto(stream)
+    hdus.writeto(stream)
     content = stream.getvalue()
     # astropy would convert the numbers itself if it knew of these cards.
     old = next(iter(re.findall(rb"EXPTIME = .{70}", content)))
@@ -187,9 +187,9 @@ def collected():
                  np.full((1, 2, 2), np.nan)), "image.fits")  # fmt: skip
 def test_image_is_read_exactly(folder, file, name):
     path = put(folder, name, file.content)
-    found = camera.read(path)
-    np.testing.assert_array_equal(found.images, file.images)
-    assert found.name == name
+    camera_file = camera.read(path)
+    np.testing.assert_array_equal(camera_file.images, file.images)
+    assert camera_file.name == name
 
 
 @pytest.mark.filterwarnings("error", "ignore::hypothesis.errors.HypothesisWarning")
@@ -203,7 +203,7 @@ def test_damaged_file_is_read_or_refused_by_name(folder, content):
     except (TypeError, ValueError) as error:
         check_message(error, "damaged.dat")
         return
-    assert all(np.isfinite(one.counts).all() for one in (*frames, *clear_frames))
+    assert all(np.isfinite(frame.counts).all() for frame in (*frames, *clear_frames))
     if content.startswith(b"\x93NUMPY"):
         with pytest.raises((TypeError, ValueError), match=r"damaged\.dat"):
             camera.read(put(folder, "damaged.dat", content + b"\0"))
@@ -230,7 +230,7 @@ def run(arguments):
     messages = io.StringIO()
     with redirect_stderr(messages), redirect_stdout(io.StringIO()):
         try:
-            code = command.main([str(one) for one in arguments])
+            code = command.main([str(argument) for argument in arguments])
         except SystemExit as end:  # argparse
             code = end.code
     return code, messages.getvalue()
@@ -242,7 +242,7 @@ def check_refusal(code, messages, *named):
     assert "Traceback" not in messages
     if code == 1:
         assert re.fullmatch(r"error: [^\n]+\n", messages)
-        assert any(one in messages for one in named)
+        assert any(name in messages for name in named)
 
 
 SHAPE = 42, 84  # of the images of the bench
@@ -265,7 +265,7 @@ def test_telemetry_is_that_of_the_counts_or_refused_by_name(folder, calibration,
         check_refusal(code, messages, "telemetry.dat")
         assert not output.exists()
         return
-    found = fits.getdata(output)
+    phases = fits.getdata(output)
     output.unlink()
     try:
         counts = camera.read(path).images
@@ -273,7 +273,7 @@ def test_telemetry_is_that_of_the_counts_or_refused_by_name(folder, calibration,
         check_message(error, "telemetry.dat")
         return
     expected = calibration(counts)
-    np.testing.assert_allclose(found, expected.phase, atol=1e-4)
+    np.testing.assert_allclose(phases, expected.phase, atol=1e-4)
 
 
 @examples
@@ -281,11 +281,11 @@ def test_telemetry_is_that_of_the_counts_or_refused_by_name(folder, calibration,
 def test_damaged_calibration_is_whole_or_refused_by_name(folder, calibration, data):
     whole = Written((folder / "bench.npz").read_bytes(), np.empty(0))
     try:
-        found = Calibration.load(put(folder, "damaged.npz", data.draw(damaged(st.just(whole)))))
+        loaded = Calibration.load(put(folder, "damaged.npz", data.draw(damaged(st.just(whole)))))
     except (TypeError, ValueError) as error:
         check_message(error, "damaged.npz")
     else:
-        assert found.sha256 == calibration.sha256
+        assert loaded.sha256 == calibration.sha256
 
 
 words = st.sampled_from(["0", "-1", "1", "nan", "1e999", "1.5", "9" * 30, "high", "", "EXPTIME", "frame.fits"])
@@ -299,14 +299,14 @@ OPTIONS = {
 @examples
 @given(st.sampled_from([*OPTIONS]), st.data())
 def test_options_are_used_or_refused(folder, bench, tool, data):
-    known = st.sampled_from(OPTIONS[tool].split())
-    options = data.draw(st.lists(st.tuples(known, st.lists(words, max_size=4)), max_size=2))
+    option_names = st.sampled_from(OPTIONS[tool].split())
+    options = data.draw(st.lists(st.tuples(option_names, st.lists(words, max_size=4)), max_size=2))
     output = folder / "options.npz"
     if tool == "calibrate":
         files = [output, "--frames", bench["frame"], "--pupils", bench["pupils"]]
     else:
         files = [bench["frame"], "--calibration", folder / "bench.npz", "-o", output]
-    code, messages = run([tool, *files, *(one for name, values in options for one in (f"--{name}", *values))])
+    code, messages = run([tool, *files, *(word for name, values in options for word in (f"--{name}", *values))])
     if code:
         named = (name.strip("s").replace("-", "_") for name, _ in options)
         check_refusal(code, messages, *named, *filter(None, words.elements), "fitted", "pixels wide")

@@ -163,24 +163,24 @@ def test_bad_files_are_refused(project, text, message):
     [("1e-3", 1e-3), ("1e3", 1000.0), ("010", 10), ("yes", "yes"), ("-.5", -0.5)],
 )
 def test_values_are_read_as_people_mean_them(text, value):
-    found = declared.load(text, "here")
-    assert (found, type(found)) == (value, type(value))
+    loaded = declared.load(text, "here")
+    assert (loaded, type(loaded)) == (value, type(value))
 
 
 def test_command_line_wins_over_the_file(project, monkeypatch):
-    made = []
-    monkeypatch.setattr(rerun, "make", lambda project, name, changed, *rest: made.append(changed) or 1.0)
+    changes = []
+    monkeypatch.setattr(rerun, "make", lambda project, name, changed, *rest: changes.append(changed) or 1.0)
     (project.root / "mine.yaml").write_text("n: 5\nwidth: 2\n")
     rerun.rerun(project, ["fig01_small", "-f", str(project.root / "mine.yaml"), "-p", "n=6"])
     rerun.rerun(project, ["fig01", "-p", "width=1.5", "-p", "steps=[]"])
-    assert made == [{"n": 6, "width": 2.0}, {"steps": []}]
+    assert changes == [{"n": 6, "width": 2.0}, {"steps": []}]
 
 
 def test_a_field_of_a_parameter_is_set_by_the_name_that_the_list_shows():
-    known = declared.parameters(read(ROOT / "notebooks" / "fig03_dynamic_range.ipynb"))
+    parameters = declared.parameters(read(ROOT / "notebooks" / "fig03_dynamic_range.ipynb"))
 
-    def changed(*texts, **given):
-        return declared.accept(declared.joined(given | declared.assignments(list(texts)), known), known)
+    def changed(*texts, **values):
+        return declared.accept(declared.joined(values | declared.assignments(list(texts)), parameters), parameters)
 
     assert changed("pupil.kind=vlt") == {"pupil": {"kind": "vlt"}}
     both = {"kind": "vlt", "obstruction": 0.2}
@@ -193,9 +193,9 @@ def test_a_field_of_a_parameter_is_set_by_the_name_that_the_list_shows():
 
 
 def test_the_recorded_command_gives_the_same_parameters():
-    given = {"files": ["\U0001d54f.fits", "a 'b' \"c\""], "n": 3}
-    options = shlex.split(rerun.command("fig", given).removeprefix(f"{rerun.COMMAND} fig"))
-    assert declared.assignments([text for text in options if text != "-p"]) == given
+    parameters = {"files": ["\U0001d54f.fits", "a 'b' \"c\""], "n": 3}
+    options = shlex.split(rerun.command("fig", parameters).removeprefix(f"{rerun.COMMAND} fig"))
+    assert declared.assignments([text for text in options if text != "-p"]) == parameters
 
 
 def test_folder_holds_all_that_was_made(ran):
@@ -353,9 +353,9 @@ def test_make_evaluates_no_argument(tmp_path, name, text):
     python.chmod(0o755)
     command = ["make", "--silent", "--old-file=.venv/.ready", "rerun"]
     expected = f"--line= {text}" if name == "ARGS" else f"--line={text} "
-    for given, environment in (([f"{name}={text}"], {}), ([], {name: text})):
+    for arguments, environment in (([f"{name}={text}"], {}), ([], {name: text})):
         done = subprocess.run(
-            [*command, *given], cwd=tmp_path, env=os.environ | environment, capture_output=True, text=True
+            [*command, *arguments], cwd=tmp_path, env=os.environ | environment, capture_output=True, text=True
         )
         assert done.stderr == ""
         assert done.stdout.split("\0")[:4] == ["-m", "book._tools", "rerun", expected]

@@ -60,8 +60,8 @@ def settings(name):
 
 def native(name, values, figure, folder=ROOT):
     """Return the columns that a notebook publishes with these parameters, computed here; files are in a folder."""
-    given = {key: json.dumps(value) for key, value in values.items()}
-    command = [sys.executable, "-c", NATIVE, json.dumps([settings(name), given, figure])]
+    parameters = {key: json.dumps(value) for key, value in values.items()}
+    command = [sys.executable, "-c", NATIVE, json.dumps([settings(name), parameters, figure])]
     paths = os.pathsep.join([str(ROOT), str(ROOT / "notebooks")])
     done = subprocess.run(
         command, cwd=folder, env=os.environ | {"PYTHONPATH": paths}, capture_output=True, text=True
@@ -73,25 +73,25 @@ def native(name, values, figure, folder=ROOT):
 def columns(text):
     """Return the columns of a CSV file by their headers: numbers where all are numbers."""
     header, *rows = csv.reader(io.StringIO(text.strip()))
-    made = {}
+    arrays = {}
     for name, column in zip(header, zip(*rows, strict=True), strict=True):
         try:
-            made[name] = np.array([cell for cell in column if cell], float)  # others are longer
+            arrays[name] = np.array([cell for cell in column if cell], float)  # others are longer
         except ValueError:
-            made[name] = np.array(column)
-    return made
+            arrays[name] = np.array(column)
+    return arrays
 
 
 @pytest.fixture(scope="module")
 def book():
-    with serving(HTML) as address:
-        yield address
+    with serving(HTML) as url:
+        yield url
 
 
 class Page:
     """A page of the book with its form; Pyodide comes from the folder of the tests instead of its public place."""
 
-    def __init__(self, browser, address, damaged="", **options):
+    def __init__(self, browser, url, damaged="", **options):
         self.context = browser.new_context(**options)
         self.place = settings("settings")["place"]
         self.damaged = damaged
@@ -100,7 +100,7 @@ class Page:
         self.page.set_default_timeout(2 * MINUTE)
         self.said, self.asked = watch(self.page)
         self.context.on("request", lambda request: self.asked.append(request.url))
-        self.page.goto(address)
+        self.page.goto(url)
         self.status = self.page.locator(".run-details [role=status]")
 
     def serve(self, route):
@@ -123,7 +123,7 @@ class Page:
         self.open()
         for name, value in values.items():
             if isinstance(value, dict):
-                self.fill(**{f"{name}.{key}": one for key, one in value.items()})
+                self.fill(**{f"{name}.{key}": item for key, item in value.items()})
                 continue
             field = self.page.locator(f'[name="{name}"]')
             if field.evaluate("one => one.tagName") == "SELECT":
@@ -156,8 +156,8 @@ def opened(browser, book):
         return pages[-1]
 
     yield open_
-    for one in pages:
-        one.context.close()
+    for page in pages:
+        page.context.close()
 
 
 @pytest.fixture(scope="module")
@@ -169,13 +169,13 @@ def figure4(browser, book):
     page.context.close()
 
 
-def assert_equal_columns(found, expected, tolerance=1e-9):
-    assert list(found) == list(expected)
+def assert_equal_columns(actual, expected, tolerance=1e-9):
+    assert list(actual) == list(expected)
     for name, column in expected.items():
         if column.dtype.kind == "f":
-            np.testing.assert_allclose(found[name], column, rtol=tolerance, atol=tolerance, err_msg=name)
+            np.testing.assert_allclose(actual[name], column, rtol=tolerance, atol=tolerance, err_msg=name)
         else:
-            assert list(found[name]) == list(column)
+            assert list(actual[name]) == list(column)
 
 
 @pytest.mark.parametrize(
@@ -199,7 +199,7 @@ def test_figures_of_the_page_are_those_of_this_python(opened, name, figure, valu
 
 
 def test_figure_4_is_that_of_this_python_and_all_else_of_the_page_is_left_alone(figure4):
-    assert not [one for one in figure4.asked if not one.startswith("http://127.0.0.1")], "before the click"
+    assert not [url for url in figure4.asked if not url.startswith("http://127.0.0.1")], "before the click"
     assert figure4.run().startswith("Done"), figure4.said
     place = figure4.page.locator("figure.variants-fig04_dimple_diameter")
     assert place.locator(".run-mark").inner_text().startswith("Your parameters: n_pixels = 40")
@@ -207,9 +207,9 @@ def test_figure_4_is_that_of_this_python_and_all_else_of_the_page_is_left_alone(
     picture = place.locator(".run-yours .only-light img")
     assert picture.evaluate("one => one.naturalWidth") > 1000
     assert_equal_columns(figure4.columns(), native("fig04_dimple_diameter", SMALL, "fig04_dimple_diameter"), 1e-6)
-    later = [one for one in figure4.asked if not one.startswith(("http://127.0.0.1", "blob:", "data:"))]
+    later = [url for url in figure4.asked if not url.startswith(("http://127.0.0.1", "blob:", "data:"))]
     assert later
-    assert all(one.startswith(figure4.place) for one in later)
+    assert all(url.startswith(figure4.place) for url in later)
     figure4.page.click(".run-switch")
     assert place.locator(".run-book").first.is_visible()
     assert not picture.is_visible()
@@ -220,8 +220,10 @@ def test_figure_4_is_that_of_this_python_and_all_else_of_the_page_is_left_alone(
     "values", [{"n_screens": "1e3"}, {"more_iterations": "[0]"}, {"pupil": {"kind": "elt"}, "n_pixels": "16"}]
 )
 def test_bad_values_are_refused_with_the_message_of_a_rerun(figure4, values):
-    given = [f"{key}={json.dumps(one) if isinstance(one, dict) else one}" for key, one in values.items()]
-    options = [option for one in given for option in ("-p", one)]
+    assignments = [
+        f"{key}={json.dumps(value) if isinstance(value, dict) else value}" for key, value in values.items()
+    ]
+    options = [option for assignment in assignments for option in ("-p", assignment)]
     command = [sys.executable, "-m", "book._tools", "rerun", "fig04_dimple_diameter", *options]
     rerun = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert rerun.returncode == 2
@@ -235,14 +237,14 @@ def test_a_run_can_be_stopped_and_repeated_and_its_address_shared(figure4):
     page = figure4.page
     page.get_by_role("button", name="Values of the book").click()
     figure4.fill(**SMALL, seed=7)
-    address = page.evaluate("location.href")
+    url = page.evaluate("location.href")
     page.click(".run-details button[type=submit]")
     page.wait_for_function("document.querySelector('.run-details [role=status]').textContent.startsWith('Cell')")
     page.get_by_role("button", name="Stop").click()
     page.wait_for_function("document.querySelector('.run-details progress').hidden")
     assert figure4.status.inner_text().startswith("Stopped")
     page.goto("about:blank")
-    page.goto(address)
+    page.goto(url)
     assert page.locator("[name=seed]").input_value() == "7"
     assert page.locator("[name=more_iterations]").input_value() == "50"
     command = page.locator(".run-command code").inner_text()
@@ -314,7 +316,7 @@ def test_own_frames_in_npy_are_reconstructed_and_stay_on_this_computer(opened, t
     files = {name: [f"{name}.npy"] for name in kinds}
     assert_equal_columns(page.columns(), native("own_frames", values | files, "own_phase", tmp_path), 1e-6)
     assert not [
-        one for one in page.asked if not one.startswith(("http://127.0.0.1", "blob:", "data:", page.place))
+        url for url in page.asked if not url.startswith(("http://127.0.0.1", "blob:", "data:", page.place))
     ]
 
 
@@ -340,7 +342,7 @@ def test_figures_and_sentences_of_a_page_follow_and_results_of_the_book_are_mark
 
 @pytest.mark.parametrize("name", ["pyodide.asm.js", "pyodide.asm.wasm", "pyodide-lock.json", "numpy"])
 def test_a_damaged_download_is_refused(opened, name):
-    file = next(one.name for one in Path(PYODIDE).iterdir() if one.name.startswith(name))
+    file = next(path.name for path in Path(PYODIDE).iterdir() if path.name.startswith(name))
     page = opened("notebooks/fig01_sensor_layout.html", damaged=file)
     assert file in page.run()
     assert page.page.locator(".run-yours").count() == 0

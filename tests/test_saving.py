@@ -36,14 +36,14 @@ def test_a_saved_result_holds_all_arrays(tmp_path, result, ending):
     result.save(path)
     if ending == ".fits":
         with fits.open(path) as units:
-            found = {unit.name: unit.data for unit in units}
+            arrays = {unit.name: unit.data for unit in units}
             np.testing.assert_array_equal(units[0].data, result.phase)
     else:
         with np.load(path) as file:
-            found = {name.upper(): file[name] for name in file.files}
+            arrays = {name.upper(): file[name] for name in file.files}
             assert json.loads(str(file["values"]))["settings n_iterations"] == 50
     for name in ("phase", "converged", "chi2", "frames"):
-        np.testing.assert_array_equal(found[name.upper()], getattr(result, name))
+        np.testing.assert_array_equal(arrays[name.upper()], getattr(result, name))
 
 
 def test_an_existing_file_stays_and_other_endings_are_refused(tmp_path, result):
@@ -72,9 +72,9 @@ def results():
     registered = register_frames(*([Image.of(counts, "image") for counts in pair] for pair in (frames, clear)))
     measurement = reduce_frames(registered, Optics())
     phases = recover_phase(measurement)
-    made = [phases, measurement, phases.agreement, registered, registered.placement]
-    made += [judge(phases), ImageOrder(Optics(), False, 1.0, 0.0)]
-    return {type(one).__name__: one for one in made}
+    instances = [phases, measurement, phases.agreement, registered, registered.placement]
+    instances += [judge(phases), ImageOrder(Optics(), False, 1.0, 0.0)]
+    return {type(instance).__name__: instance for instance in instances}
 
 
 @pytest.mark.parametrize(
@@ -98,5 +98,5 @@ def test_numbers_of_another_kind_are_named(results):
 
 
 def test_a_figure_of_a_verdict_shows_the_control(results):
-    [axes] = (one for one in results["Verdict"].plot().axes if one.get_xlabel() == "image")
+    [axes] = (axes for axes in results["Verdict"].plot().axes if axes.get_xlabel() == "image")
     assert [line.get_label() for line in axes.lines] == ["score", "control"]

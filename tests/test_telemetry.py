@@ -119,14 +119,14 @@ def test_phase_is_that_of_the_plain_iteration_in_double_precision(bench, optics,
     bad = np.zeros(bench.flat.shape, bool)
     bad.flat[np.random.default_rng(2).choice(bad.size, n_bad, replace=False)] = True
     calibration = bench.calibration(optics, bad, tolerance=1e-5, n_iterations=50)
-    found = calibration(np.where(bad, np.nan, bench.frames[:3]))  # known bad pixels raise no flag
+    estimate = calibration(np.where(bad, np.nan, bench.frames[:3]))  # known bad pixels raise no flag
     registered = bench.registered(bad)
-    for phase, counts in zip(found.phase, bench.frames, strict=False):
-        one = replace(registered, frames=(bench.image(counts, bad),) * 2)
-        measurement = reduce_frames(one, optics)
+    for phase, counts in zip(estimate.phase, bench.frames, strict=False):
+        exposure = replace(registered, frames=(bench.image(counts, bad),) * 2)
+        measurement = reduce_frames(exposure, optics)
         assert rms(phase - iterated_phase(measurement, 60, 1e-6)) < apart
         np.testing.assert_array_equal(np.isfinite(phase), measurement.good)
-    assert not found.flags.any()
+    assert not estimate.flags.any()
 
 
 def test_longer_exposure_time_of_the_frames_changes_no_phase(bench, calibration):
@@ -134,10 +134,10 @@ def test_longer_exposure_time_of_the_frames_changes_no_phase(bench, calibration)
         return 3.0 * counts - 2 * DARK
 
     registered = register_frames([bench.image(longer(bench.flat))], [bench.image(bench.clear)], exposure=3.0)
-    other = Calibration.of(reduce_frames(registered, Optics()), saturation=1e6)
-    found, expected = other(longer(bench.frames[:2])), calibration(bench.frames[:2])
-    np.testing.assert_allclose(found.phase, expected.phase, rtol=0, atol=1e-4)
-    assert not found.flags.any()
+    recalibrated = Calibration.of(reduce_frames(registered, Optics()), saturation=1e6)
+    estimate, expected = recalibrated(longer(bench.frames[:2])), calibration(bench.frames[:2])
+    np.testing.assert_allclose(estimate.phase, expected.phase, rtol=0, atol=1e-4)
+    assert not estimate.flags.any()
 
 
 def test_phase_is_that_which_was_put_in(bench, calibration):
@@ -164,13 +164,13 @@ def test_calibration_is_kept_in_a_file_and_in_a_pickle(tmp_path, bench, calibrat
     loaded.save(tmp_path / "b.npz")
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     expected = calibration(bench.frames[:2]).phase
-    for other in (loaded, pickle.loads(pickle.dumps(calibration))):
-        np.testing.assert_array_equal(other(bench.frames[:2]).phase, expected)
-        assert other.sha256 == calibration.sha256
+    for restored in (loaded, pickle.loads(pickle.dumps(calibration))):
+        np.testing.assert_array_equal(restored(bench.frames[:2]).phase, expected)
+        assert restored.sha256 == calibration.sha256
         with pytest.raises(ValueError, match="read-only"):
-            other.amplitude[0, 0] = 1
+            restored.amplitude[0, 0] = 1
         with pytest.raises(AttributeError):
-            other.n_images = 2
+            restored.n_images = 2
 
 
 def rewritten(path, **changes):
@@ -243,8 +243,8 @@ def test_each_method_recovers_a_poke(bench, calibration, method):
     poke = 0.3 * modes[3]
     counts = bench.expose(bench.sensor.measure(np.stack([0 * poke, poke])))
     wide = zernike_basis(calibration.sensor.pupil, 60, orthonormal=True)
-    found = calibration(counts, method=method(calibration.sensor, wide)).phase
-    change = nearest_good(found[1] - found[0], np.isfinite(found[0]))
+    phases = calibration(counts, method=method(calibration.sensor, wide)).phase
+    change = nearest_good(phases[1] - phases[0], np.isfinite(phases[0]))
     shape = np.array(calibration.good.shape)
     first = (shape - D) // 2
     change = change[first[0] : first[0] + D, first[1] : first[1] + D]
@@ -255,22 +255,22 @@ def test_each_method_recovers_a_poke(bench, calibration, method):
 def test_light_is_measured_in_each_frame(bench, calibration, faint):
     image = np.concatenate(list(bench.sensor.measure(bench.screens[0])), axis=-1)
     counts = np.random.default_rng(5).poisson(faint * PHOTONS * image) + DARK
-    found, bright = calibration(counts), calibration(bench.frames[0])
-    assert found.flags == 0
-    assert found.flux == pytest.approx(faint, rel=0.03)
-    assert rms(found.phase - bright.phase) < 1.5 / np.sqrt(faint * PHOTONS)
+    estimate, bright = calibration(counts), calibration(bench.frames[0])
+    assert estimate.flags == 0
+    assert estimate.flux == pytest.approx(faint, rel=0.03)
+    assert rms(estimate.phase - bright.phase) < 1.5 / np.sqrt(faint * PHOTONS)
 
 
 def test_calibration_takes_the_dark_of_the_frames(folder, bench):
     for name, image in (("long", bench.dark + 100), ("short", bench.dark)):
         fits.PrimaryHDU(np.stack([image - 1, image + 1])).writeto(f"{name}.fits")
     fits.PrimaryHDU(bench.flat + 100.0, fits.Header(OPTICS)).writeto("frame.fits", overwrite=True)
-    made = Calibration.from_files(["frame.fits"], ["pupils.fits"], ["long.fits"], pupil_dark_files=["short.fits"])
-    np.testing.assert_array_equal(made.dark[0], bench.dark + 100)
+    mixed = Calibration.from_files(["frame.fits"], ["pupils.fits"], ["long.fits"], pupil_dark_files=["short.fits"])
+    np.testing.assert_array_equal(mixed.dark[0], bench.dark + 100)
     expected = Calibration.from_files(
         ["frame.fits"], ["pupils.fits"], ["long.fits"], pupil_dark_files=["dark.fits"]
     )
-    np.testing.assert_array_equal(made(bench.frames[0] + 100.0).phase, expected(bench.frames[0] + 100.0).phase)
+    np.testing.assert_array_equal(mixed(bench.frames[0] + 100.0).phase, expected(bench.frames[0] + 100.0).phase)
 
 
 # Flags
@@ -291,20 +291,20 @@ def test_frames_with_faults_are_flagged_and_the_others_stay(bench, calibration):
     frames[5, 0, 0] = np.inf  # outside the pupil
     frames[6, :, : frames.shape[2] // 2] = DARK  # an image is lost
     frames[7, 20:40] = -np.inf
-    found = calibration(frames)
+    estimate = calibration(frames)
     bad, saturated = Flag.BAD_PIXELS, Flag.BAD_PIXELS | Flag.SATURATED
-    assert found.flags.tolist() == [0, 1, 3, saturated, bad, 0, 1, 3]
-    lost = found.flags & Flag.LOST > 0
-    assert np.isnan(found.phase[lost]).all()
-    good = found.phase[0]
+    assert estimate.flags.tolist() == [0, 1, 3, saturated, bad, 0, 1, 3]
+    lost = estimate.flags & Flag.LOST > 0
+    assert np.isnan(estimate.phase[lost]).all()
+    good = estimate.phase[0]
     for index, image in ((3, 0), (4, 1)):
-        assert found.n_bad[index] == 1
-        touched = np.argwhere(np.isnan(found.phase[index]) & np.isfinite(good))
+        assert estimate.n_bad[index] == 1
+        touched = np.argwhere(np.isnan(estimate.phase[index]) & np.isfinite(good))
         assert 1 <= len(touched) <= 4
         assert np.abs(touched - inside).max() <= 1, image
-        assert rms(found.phase[index] - good) < 0.02
-    assert found.n_saturated.tolist() == [0, 0, 0, 1, 0, 0, 0, 0]
-    np.testing.assert_array_equal(found.phase[5], good)
+        assert rms(estimate.phase[index] - good) < 0.02
+    assert estimate.n_saturated.tolist() == [0, 0, 0, 1, 0, 0, 0, 0]
+    np.testing.assert_array_equal(estimate.phase[5], good)
 
 
 def test_iteration_that_does_not_end_is_flagged(bench, calibration):
@@ -317,9 +317,9 @@ def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibr
     cube[[3, 7]] = np.nan
     cube[5, :, half:] = cube[6, :, half:]  # two images that do not belong together
     np.save("wrong.npy", cube)
-    some = {"modes": 3, "phases": True, "saturation": 65535}
-    found = reconstruct("wrong.npy", calibration, "phase.fits", **some)
-    assert (found.counts["LOST"], found.counts["INCONSISTENT"], found.n_flagged) == (2, 1, 3)
+    options = {"modes": 3, "phases": True, "saturation": 65535}
+    summary = reconstruct("wrong.npy", calibration, "phase.fits", **options)
+    assert (summary.counts["LOST"], summary.counts["INCONSISTENT"], summary.n_flagged) == (2, 1, 3)
     phase, table = fits.getdata("phase.fits"), fits.getdata("phase.fits", "FRAMES")
     assert np.flatnonzero(table["FLAGS"]).tolist() == [3, 5, 7]
     assert np.isnan(phase[[3, 7]]).all()
@@ -328,15 +328,15 @@ def test_frames_between_bad_ones_stay_and_none_is_left_out(folder, bench, calibr
     expected = calibration(bench.frames).phase[others]  # other batches, so the sums are rounded otherwise
     np.testing.assert_allclose(phase[others], expected, rtol=0, atol=1e-6)
     assert table["RESIDUAL"][5] > 2 * table["RESIDUAL"][others].max()
-    strict = reconstruct("wrong.npy", calibration, "strict.fits", largest_residual=0.0, **some)
+    strict = reconstruct("wrong.npy", calibration, "strict.fits", largest_residual=0.0, **options)
     assert strict.counts["INCONSISTENT"] == 10
 
 
 @pytest.mark.parametrize(("moved", "flags"), [((0, 0), 0), ((1, 0), Flag.MOVED), ((0, -1), Flag.MOVED)])
 def test_images_that_have_moved_are_flagged(bench, calibration, moved, flags):
-    found = calibration(np.roll(bench.frames, moved, axis=(1, 2)))
-    assert np.all(found.flags & Flag.MOVED == flags)
-    np.testing.assert_allclose(found.displacement, [moved] * 12, atol=0.5)
+    estimate = calibration(np.roll(bench.frames, moved, axis=(1, 2)))
+    assert np.all(estimate.flags & Flag.MOVED == flags)
+    np.testing.assert_allclose(estimate.displacement, [moved] * 12, atol=0.5)
 
 
 def test_header_states_units_and_the_place_of_the_map(folder, calibration):
@@ -370,8 +370,8 @@ def test_coefficients_are_those_that_were_put_in(bench, calibration):
     matrix = calibration.modal_matrix(modes)
     put = np.random.default_rng(5).normal(0, 0.15, (4, 9)).astype(np.float32)
     filled = np.tensordot(put, np.nan_to_num(modes), 1)
-    found = calibration(bench.frames[:4])
-    np.testing.assert_allclose(calibration.coefficients(replace(found, filled=filled), matrix), put, atol=1e-4)
+    estimate = calibration(bench.frames[:4])
+    np.testing.assert_allclose(calibration.coefficients(replace(estimate, filled=filled), matrix), put, atol=1e-4)
 
 
 def linear(calibration):
@@ -387,10 +387,10 @@ def test_linear_method_replaces_the_iteration(bench):
         calibration = bench.calibration(optics)
         phase = calibration(images, method=linear(calibration)).phase
         row, column = np.rint(calibration.places[0, :, 0, 0] - MARGIN).astype(int)
-        found = phase[:, -row : D - row, -column : D - column]
-        inside = np.isfinite(found[0]) & bench.pupil.inside
-        found, put = (one[:, inside] - one[:, inside].mean(axis=1, keepdims=True) for one in (found, small))
-        return np.sum(found * put) / np.sum(put**2)
+        phase = phase[:, -row : D - row, -column : D - column]
+        inside = np.isfinite(phase[0]) & bench.pupil.inside
+        phase, put = (maps[:, inside] - maps[:, inside].mean(axis=1, keepdims=True) for maps in (phase, small))
+        return np.sum(phase * put) / np.sum(put**2)
 
     assert gain(Optics(leakage=leakage)) == pytest.approx(1, abs=0.03)
     assert gain(Optics()) == pytest.approx(1 - 2 * leakage, abs=0.03)
@@ -399,18 +399,18 @@ def test_linear_method_replaces_the_iteration(bench):
 def test_method_keeps_the_flags_and_fills_bad_pixels(bench, calibration):
     images = np.stack([bench.frames[0], bench.frames[0], np.full_like(bench.frames[0], DARK)]).astype(float)
     images[1][pixel(calibration, (20, 20))] = np.nan
-    found = calibration(images, method=linear(calibration))
-    assert found.flags.tolist() == [0, Flag.BAD_PIXELS, Flag.LOST]
-    assert np.isfinite(found.filled[:2]).all()
-    assert rms(found.filled[1] - found.filled[0]) < 0.01
+    estimate = calibration(images, method=linear(calibration))
+    assert estimate.flags.tolist() == [0, Flag.BAD_PIXELS, Flag.LOST]
+    assert np.isfinite(estimate.filled[:2]).all()
+    assert rms(estimate.filled[1] - estimate.filled[0]) < 0.01
     same = PhaseShifted(calibration.sensor, accelerate=True, tolerance=1e-3)
     assert rms(calibration(images[:2], method=same).phase - calibration(images[:2]).phase) < 1e-3
 
 
 def test_method_of_another_sensor_is_refused(bench, calibration):
-    other = replace(calibration, n_iterations=3)
+    mismatched = replace(calibration, n_iterations=3)
     with pytest.raises(ValueError, match="method has another sensor"):
-        calibration(bench.frames[0], method=linear(other))
+        calibration(bench.frames[0], method=linear(mismatched))
     with pytest.raises(TypeError, match="method is a str: expected a Reconstructor"):
         calibration(bench.frames[0], method="linear")
     flat = np.zeros(calibration.good.shape)
@@ -424,17 +424,17 @@ def test_sigma_without_errors_of_the_calibration_is_the_scatter_of_many_exposure
     )
     frames = np.stack([bench.expose(bench.sensor.measure(bench.screens[0])) for _ in range(60)])
     modes = zernike_basis(calibration.sensor.pupil, 9)
-    found = calibration(frames)
+    estimate = calibration(frames)
     photons = float(calibration.unit.mean())
-    one = replace(found, **{name: value[:1] for name, value in found._arrays()})
-    scatter = calibration.coefficients(found, calibration.modal_matrix(modes)).std(axis=0)
-    sigma = calibration.sigma(one, photons, modes=modes)[0]
+    first = replace(estimate, **{name: value[:1] for name, value in estimate._arrays()})
+    scatter = calibration.coefficients(estimate, calibration.modal_matrix(modes)).std(axis=0)
+    sigma = calibration.sigma(first, photons, modes=modes)[0]
     assert 0.8 < np.median(scatter / sigma) < 1.4
-    points = calibration.sigma(one, photons)[0]
-    np.testing.assert_array_equal(np.isnan(points), np.isnan(found.phase[0]))
-    phase = found.phase - np.nanmean(found.phase, axis=(1, 2), keepdims=True)
+    points = calibration.sigma(first, photons)[0]
+    np.testing.assert_array_equal(np.isnan(points), np.isnan(estimate.phase[0]))
+    phase = estimate.phase - np.nanmean(estimate.phase, axis=(1, 2), keepdims=True)
     assert 0.7 < np.nanmedian(phase.std(axis=0) / points) < 1.2  # resampling smooths the noise a little
-    noisy = calibration.sigma(one, photons, read_noise=100.0)
+    noisy = calibration.sigma(first, photons, read_noise=100.0)
     assert (noisy[0] > points)[np.isfinite(points)].all()
 
 
@@ -442,9 +442,9 @@ def test_sigma_without_errors_of_the_calibration_is_the_scatter_of_many_exposure
 
 
 def test_file_holds_phases_table_and_keywords(folder, bench, calibration):
-    some = {"keywords": ["exptime", "BUNIT"], "photons": 1e4, "read_noise": 2, "modes": 6, "phases": True}
-    found = reconstruct("cube.fits", "bench.npz", "out/phase.fits", **some)
-    assert (found.n_frames, found.n_flagged, found.n_resumed) == (12, 0, 0)
+    options = {"keywords": ["exptime", "BUNIT"], "photons": 1e4, "read_noise": 2, "modes": 6, "phases": True}
+    summary = reconstruct("cube.fits", "bench.npz", "out/phase.fits", **options)
+    assert (summary.n_frames, summary.n_flagged, summary.n_resumed) == (12, 0, 0)
     expected = calibration(bench.frames)
     matrix = calibration.modal_matrix(zernike_basis(calibration.sensor.pupil, 6))
     with fits.open("out/phase.fits") as units:
@@ -675,16 +675,16 @@ def test_list_of_files_is_one_cube(folder, bench, calibration):
     assert table["DATE-OBS"][11] == "2026-11-22T10:00:11"
     assert fits.getdata("phase.fits", "FILES")["NAME"][3] == "frame03.fits"
     np.testing.assert_array_equal(fits.getdata("phase.fits"), calibration(bench.frames).phase)
-    one = reconstruct(names[0], calibration, "one.fits")
-    assert (one.n_frames, one.counts["INCONSISTENT"]) == (1, 0)
+    summary = reconstruct(names[0], calibration, "one.fits")
+    assert (summary.n_frames, summary.counts["INCONSISTENT"]) == (1, 0)
 
 
 @pytest.mark.parametrize("kind", ["pairs", "extensions", "second files", "single pair", "single extensions"])
 def test_second_image_is_read_wherever_it_is(tmp_path, kind):
     pairs = np.arange(5 * 2 * 6 * 7, dtype=np.int16).reshape(5, 2, 6, 7)
-    path, other = tmp_path / "a.fits", tmp_path / "b.npy"
+    path, second = tmp_path / "a.fits", tmp_path / "b.npy"
     pairs = pairs[:1] if kind.startswith("single") else pairs
-    np.save(other, pairs[:, 1].astype(">i2"))
+    np.save(second, pairs[:, 1].astype(">i2"))
     images = {
         "pairs": [pairs],
         "extensions": [None, pairs[:, 0], pairs[:, 1]],
@@ -693,7 +693,7 @@ def test_second_image_is_read_wherever_it_is(tmp_path, kind):
         "single extensions": [pairs[0, 0], pairs[0, 1]],
     }[kind]
     fits.HDUList([fits.PrimaryHDU(images[0]), *map(fits.ImageHDU, images[1:])]).writeto(path)
-    stack = Stack([path], [other] if kind == "second files" else [], 2, (6, 7))
+    stack = Stack([path], [second] if kind == "second files" else [], 2, (6, 7))
     np.testing.assert_array_equal(stack.read(0, stack.n), pairs)
 
 
@@ -790,7 +790,7 @@ CALIBRATE = [
 
 def each_and_all(options):
     """Each option alone, and all together."""
-    return [*((one,) for one in options), options]
+    return [*((option,) for option in options), options]
 
 
 @pytest.mark.parametrize("chosen", each_and_all(RECONSTRUCT))

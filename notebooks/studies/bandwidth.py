@@ -86,11 +86,11 @@ def _band_point(
 ) -> dict[str, Any]:
     """Errors with and without noise, (n_screens,) each, and the bound, at one bandwidth."""
     light = PolychromaticSensor.flat_band(sensor, bandwidth, _WAVELENGTHS, chromatic=chromatic)
-    known = PolychromaticSensor.flat_band(sensor, bandwidth, _KNOWN_WAVELENGTHS, chromatic=chromatic)
+    informed = PolychromaticSensor.flat_band(sensor, bandwidth, _KNOWN_WAVELENGTHS, chromatic=chromatic)
     methods = {
         SHIFTED: PhaseShifted(sensor, n_iterations=100, accelerate=True),
         IGNORED: MaximumLikelihood(sensor, photons=photons, n_starts=1),
-        KNOWN: MaximumLikelihood(known, photons=photons, n_starts=1),
+        KNOWN: MaximumLikelihood(informed, photons=photons, n_starts=1),
     }
 
     def errors(ways: tuple[str, ...], frames: NDArray) -> dict[str, NDArray]:
@@ -120,13 +120,13 @@ def draw_band_errors(curves: CaseCurves) -> Figure:
     figure, panels = plt.subplots(
         n_rows, n_columns, figsize=(7, 1.2 + 2.5 * n_rows), sharex=True, sharey=True, squeeze=False
     )
-    for axes, ((rms, chromatic), one) in zip(panels.flat, curves.items(), strict=True):
+    for axes, ((rms, chromatic), curve) in zip(panels.flat, curves.items(), strict=True):
         axes.axhline(1, color="#999999", lw=5, solid_capstyle="round", label="bound in the band", zorder=0)
         for name, method in WAYS.items():
             look, way = LOOKS[method], name.rpartition(" ")[2]
             line, face = _LINES[way]
             axes.plot(
-                100 * one.bandwidths, one.error(name) / one.bound, label=f"{look.name}, bandwidth {way}",
+                100 * curve.bandwidths, curve.error(name) / curve.bound, label=f"{look.name}, bandwidth {way}",
                 color=look.color, marker=look.marker, linestyle=line, markerfacecolor=face, ms=6,
             )  # fmt: skip
         axes.set_title(f"{rms:g} rad rms, {_kind(chromatic)} shifts", fontsize=10)
@@ -149,49 +149,49 @@ def _kind(chromatic: bool) -> str:
 def band_screens(curves: CaseCurves) -> dict[str, NDArray]:
     """Errors of every single screen."""
     tables = {}
-    for (rms, chromatic), one in curves.items():
-        errors = one.errors | {f"{way}, without noise": bias for way, bias in one.biases.items()}
-        tables[f"{rms:g} rad rms, {_kind(chromatic)}"] = screen_errors("bandwidth", one.bandwidths, errors)
+    for (rms, chromatic), curve in curves.items():
+        errors = curve.errors | {f"{way}, without noise": bias for way, bias in curve.biases.items()}
+        tables[f"{rms:g} rad rms, {_kind(chromatic)}"] = screen_errors("bandwidth", curve.bandwidths, errors)
     return stacked("case", tables)
 
 
 def findings(curves: CaseCurves) -> Text:
     """Return the cost of an ignored and of a known band."""
-    some_curves = next(iter(curves.values()))
+    any_curves = next(iter(curves.values()))
     costs = []
-    for place in sorted({some_curves.at(0.10), int(np.argmax(some_curves.bandwidths))}):
+    for place in sorted({any_curves.at(0.10), int(np.argmax(any_curves.bandwidths))}):
         least, most = (two_digits(100 * value) for value in _biases(curves, place))
-        costs.append(f"{least} to {most} % in a band of {_width(some_curves, place)}")
-    known = max((one.error(KNOWN) / one.bound).max() for one in curves.values())
+        costs.append(f"{least} to {most} % in a band of {_width(any_curves, place)}")
+    worst = max((curve.error(KNOWN) / curve.bound).max() for curve in curves.values())
     return Text(
         "**If the band is ignored, the error of the phase-shifted iteration without noise is, over the input, "
-        f"{', and '.join(costs)}. A reconstructor that knows the band stays within {known:.3g} times the photon "
+        f"{', and '.join(costs)}. A reconstructor that knows the band stays within {worst:.3g} times the photon "
         "limit.**"
     )
 
 
 def _biases(curves: CaseCurves, place: int) -> tuple[float, float]:
     """Smallest and largest error without noise of the phase-shifted iteration, over the input."""
-    shares = [float(one.bias(SHIFTED)[place]) / rms for (rms, _), one in curves.items()]
+    shares = [float(curve.bias(SHIFTED)[place]) / rms for (rms, _), curve in curves.items()]
     return min(shares), max(shares)
 
 
-def _width(one: BandCurves, place: int) -> str:
-    return f"{100 * one.bandwidths[place]:g} %"
+def _width(curves: BandCurves, place: int) -> str:
+    return f"{100 * curves.bandwidths[place]:g} %"
 
 
 def costs_table(curves: CaseCurves) -> Table:
     """Error without noise of the reconstructors that ignore the bandwidth, over the input, at three bandwidths."""
     short = {SHIFTED: "phase-shifted", IGNORED: "max. lik."}
-    some_curves = next(iter(curves.values()))
-    places = sorted({some_curves.at(width) for width in (0.05, 0.10, 0.25)})
-    header = [f"{short[way]}, {_width(some_curves, place)}" for way in IGNORANT for place in places]
+    any_curves = next(iter(curves.values()))
+    places = sorted({any_curves.at(width) for width in (0.05, 0.10, 0.25)})
+    header = [f"{short[way]}, {_width(any_curves, place)}" for way in IGNORANT for place in places]
     rows = [
         [
             f"{rms:g} rad, {_kind(chromatic)}",
-            *(f"{one.bias(way)[place] / rms:.2%}" for way in IGNORANT for place in places),
+            *(f"{curve.bias(way)[place] / rms:.2%}" for way in IGNORANT for place in places),
         ]
-        for (rms, chromatic), one in curves.items()
+        for (rms, chromatic), curve in curves.items()
     ]
     return Table(["input, shifts", *header], rows)
 

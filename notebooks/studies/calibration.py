@@ -114,16 +114,16 @@ class Recording:
         return counts / share, sigma / share
 
 
-def calibrate(taken: Recording, n_commands: int = 4, n_steps: int = 3, oversampling: int = 2) -> Calibration:
+def calibrate(recording: Recording, n_commands: int = 4, n_steps: int = 3, oversampling: int = 2) -> Calibration:
     """Fit the bench to the frames of the flat and of known commands."""
     states = slice(n_commands + 1)
     return Calibration.fit(
-        taken.frames[states],
-        taken.clear_frames,
-        taken.commands[states],
-        n_pixels=taken.commands.shape[-1],
-        noise=taken.noise,
-        gain=taken.gain,
+        recording.frames[states],
+        recording.clear_frames,
+        recording.commands[states],
+        n_pixels=recording.commands.shape[-1],
+        noise=recording.noise,
+        gain=recording.gain,
         n_steps=n_steps,
         oversampling=oversampling,
     )
@@ -143,7 +143,7 @@ class Measured(NamedTuple):
 
 
 def measure(
-    taken: Recording,
+    recording: Recording,
     calibration: Calibration,
     series: Sequence[Sequence[int]],
     n_iterations: int = 25,
@@ -156,7 +156,7 @@ def measure(
     maps, places and prior of the fit, and the optics of the design.
     """
     benches = calibration, designed(calibration) if control else None
-    return sweeps.run(_measure_series, series, taken, *benches, n_iterations, name="calibrated_errors")
+    return sweeps.run(_measure_series, series, recording, *benches, n_iterations, name="calibrated_errors")
 
 
 def designed(calibration: Calibration) -> Calibration:
@@ -177,7 +177,7 @@ def fitted_bench(calibration: Calibration) -> BenchFit:
 
 def _measure_series(
     numbers: Sequence[int],
-    taken: Recording,
+    recording: Recording,
     calibration: Calibration,
     design: Calibration | None,
     n_iterations: int,
@@ -185,28 +185,30 @@ def _measure_series(
     prior: Any = True
     measured: list[Measured] = []
     for number in numbers:
-        measured.append(_measure(number, taken, calibration, None if measured else design, n_iterations, prior))
+        measured.append(
+            _measure(number, recording, calibration, None if measured else design, n_iterations, prior)
+        )
         prior = measured[-1].prior
     return measured
 
 
 def _measure(
     number: int,
-    taken: Recording,
+    recording: Recording,
     calibration: Calibration,
     design: Calibration | None,
     n_iterations: int,
     prior: Any,
 ) -> Measured:
-    counts, sigma = taken.shot(number)
-    truth, lit = taken.arrays["unseen"][number] * _UNIT, taken.arrays["lit"]
+    counts, sigma = recording.shot(number)
+    truth, lit = recording.arrays["unseen"][number] * _UNIT, recording.arrays["lit"]
     estimate = calibration(counts, smooth=prior, noise=sigma)
     [prior] = estimate.priors
     residual, bars, same_prior = _error(estimate.phase, truth, lit), np.asarray(estimate.sigma)[lit], np.nan
     if design:
         same_prior = float(_error(design(counts, smooth=prior, noise=sigma).phase, truth, lit).std())
     consistent = not estimate.flags & Flag.INCONSISTENT
-    plain = float(_plain(counts, taken, number, n_iterations).std())
+    plain = float(_plain(counts, recording, number, n_iterations).std())
     inside = float(np.mean(np.abs(residual) < bars))
     stated = float(np.sqrt(np.mean(bars**2)))
     calibrated = float(residual.std())
@@ -215,16 +217,16 @@ def _measure(
     )
 
 
-def _plain(counts: NDArray, taken: Recording, number: int, n_iterations: int) -> NDArray[np.float64]:
+def _plain(counts: NDArray, recording: Recording, number: int, n_iterations: int) -> NDArray[np.float64]:
     """Error of the phase-shifted iteration with the values of the design, on the pixels of the first image."""
     frames, clear = (
-        [Image(image, np.zeros(image.shape, bool)) for image in pair] for pair in (counts, taken.clear_frames)
+        [Image(image, np.zeros(image.shape, bool)) for image in pair] for pair in (counts, recording.clear_frames)
     )
     registered = register_frames(frames, clear)
     phase = recover_phase(reduce_frames(registered, Optics()), n_iterations).phase
     window = tuple(slice(first, first + registered.n_pixels) for first in registered.corner)
-    lit = taken.arrays["lit_on_camera"][window] & np.isfinite(phase)
-    return _error(phase, taken.arrays["unseen_on_camera"][number][window] * _UNIT, lit)
+    lit = recording.arrays["lit_on_camera"][window] & np.isfinite(phase)
+    return _error(phase, recording.arrays["unseen_on_camera"][number][window] * _UNIT, lit)
 
 
 def _error(phase: NDArray, truth: NDArray, lit: NDArray[np.bool_]) -> NDArray[np.float64]:
@@ -233,9 +235,9 @@ def _error(phase: NDArray, truth: NDArray, lit: NDArray[np.bool_]) -> NDArray[np
     return np.angle(residual * np.conj(residual.mean()))
 
 
-def known_values(taken: Recording) -> dict[str, float]:
+def known_values(recording: Recording) -> dict[str, float]:
     """Values of the bench by their names in a fit."""
-    bench = taken.arrays
+    bench = recording.arrays
     values = {name: float(bench[name]) for name in ("diameter", "leakage", "blur")} | {"unmasked": 0.0}
     values |= {name: float(value) for name, value in zip(("first", "second"), bench["shifts"], strict=True)}
     for arm in (0, 1):
@@ -256,9 +258,9 @@ _TITLES = {
 }
 
 
-def estimate_table(taken: Recording, fit: BenchFit) -> Table:
+def estimate_table(recording: Recording, fit: BenchFit) -> Table:
     """Values of the bench, those fitted, and their differences in units of the error bar."""
-    true = known_values(taken)
+    true = known_values(recording)
     rows = []
     for name, title in _TITLES.items():
         value, sigma = fit[name].value, fit[name].sigma
@@ -287,7 +289,7 @@ class Errors:
 
 
 def measure_inputs(
-    taken: Recording,
+    recording: Recording,
     calibration: Calibration,
     largest: float,
     n_screens: int,
@@ -296,27 +298,29 @@ def measure_inputs(
     control: bool = False,
 ) -> Errors:
     """Measure the bright unseen screens up to an error, on demand with a control."""
-    inputs = taken.inputs(largest)
-    series = [taken.unseen(rms, taken.photons[0])[:n_screens] for rms in inputs]
-    return Errors(inputs, measure(taken, calibration, series, n_iterations, control=control))
+    inputs = recording.inputs(largest)
+    series = [recording.unseen(rms, recording.photons[0])[:n_screens] for rms in inputs]
+    return Errors(inputs, measure(recording, calibration, series, n_iterations, control=control))
 
 
-def measure_faint(taken: Recording, calibration: Calibration, n_screens: int, n_iterations: int = 25) -> Errors:
+def measure_faint(
+    recording: Recording, calibration: Calibration, n_screens: int, n_iterations: int = 25
+) -> Errors:
     """Measure the unseen screens with the least light."""
-    rms = taken.arrays["unseen_rms"][taken.arrays["unseen_photons"] == taken.photons[-1]][:1]
-    series = [taken.unseen(rms[0], taken.photons[-1])[:n_screens]]
-    return Errors(rms, measure(taken, calibration, series, n_iterations))
+    rms = recording.arrays["unseen_rms"][recording.arrays["unseen_photons"] == recording.photons[-1]][:1]
+    series = [recording.unseen(rms[0], recording.photons[-1])[:n_screens]]
+    return Errors(rms, measure(recording, calibration, series, n_iterations))
 
 
-def bulk_errors(taken: Recording, calibration: Calibration, errors: Errors) -> NDArray[np.float64]:
+def bulk_errors(recording: Recording, calibration: Calibration, errors: Errors) -> NDArray[np.float64]:
     """Errors of the same screens without a prior, as by `reconstruct`, rad rms."""
 
     def error(number: int) -> float:
-        phase = calibration(taken.shot(number)[0]).phase.astype(float)
-        lit = taken.arrays["lit"] & np.isfinite(phase)
-        return float(_error(phase, taken.arrays["unseen"][number] * _UNIT, lit).std())
+        phase = calibration(recording.shot(number)[0]).phase.astype(float)
+        lit = recording.arrays["lit"] & np.isfinite(phase)
+        return float(_error(phase, recording.arrays["unseen"][number] * _UNIT, lit).std())
 
-    shots = [taken.unseen(rms, taken.photons[0])[: len(errors.measured[0])] for rms in errors.rms]
+    shots = [recording.unseen(rms, recording.photons[0])[: len(errors.measured[0])] for rms in errors.rms]
     return np.array([np.sqrt(np.mean([error(number) ** 2 for number in series])) for series in shots])
 
 
@@ -327,13 +331,13 @@ def draw_calibration_errors(errors: Errors, not_smooth: NDArray) -> Figure:
     """
     figure, axes = plt.subplots(figsize=(6, 4.2))
     names = "plain", "calibrated", "same_prior", "sigma"
-    plain, found, control, stated = (errors.column(name) for name in names)
+    plain, calibrated, control, stated = (errors.column(name) for name in names)
     axes.plot(errors.rms, control, "s--", color="#777777", ms=5, label="design, smooth phases")
     axes.plot(errors.rms, plain, **LOOKS["PhaseShifted"].style, label="design, any phase (iteration)")
     [line] = axes.plot(errors.rms, not_smooth, "D:", color="#333333", mfc="none", ms=6)
     line.set_label("calibrated, any phase (iteration)")
     best = OTHER_STYLES[1]["color"]
-    axes.plot(errors.rms, found, "*-", color=best, ms=9, label="calibrated, smooth phases")
+    axes.plot(errors.rms, calibrated, "*-", color=best, ms=9, label="calibrated, smooth phases")
     axes.plot(errors.rms, stated, "o", color=best, mfc="none", ms=8, label="error bar that this fit states")
     for name, color in (("plain", LOOKS["PhaseShifted"].color), ("calibrated", best)):
         axes.plot(errors.rms, errors.single(name), "_", color=color, ms=9, label=f"_{name}, single screens")
@@ -388,9 +392,9 @@ def numbers(errors: Errors, not_smooth: NDArray) -> dict[str, float | str]:
     )
 
 
-def fit_findings(taken: Recording, fit: BenchFit) -> Text:
+def fit_findings(recording: Recording, fit: BenchFit) -> Text:
     """Say whether the fit explains its frames, and how far its values are from those of the bench."""
-    true = known_values(taken)
+    true = known_values(recording)
     deviations = [(fit[name].value - value) / fit[name].sigma for name, value in true.items()]
     diameter = 100 * abs(fit["diameter"].value / true["diameter"] - 1)
     shift = 100 * max(abs(fit[name].value / true[name] - 1) for name in ("first", "second"))

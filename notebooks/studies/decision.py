@@ -87,11 +87,11 @@ class Camera(NamedTuple):
     n_images: int
 
     @classmethod
-    def of(cls, known: Known, photons: float, n_images: int) -> Camera:
+    def of(cls, recorded: RecordedBench, photons: float, n_images: int) -> Camera:
         """Return the camera with photons per point and image of two; one image gets those of both."""
-        light = photons if n_images == 2 else 2 * photons / (1 + known.bench.flux_imbalance)
-        share = light * np.count_nonzero(known.bench.segments) / known.bench.photons_per_image
-        return cls(dimmed(known.bench, light), share * known.dark, share, n_images)
+        light = photons if n_images == 2 else 2 * photons / (1 + recorded.bench.flux_imbalance)
+        share = light * np.count_nonzero(recorded.bench.segments) / recorded.bench.photons_per_image
+        return cls(dimmed(recorded.bench, light), share * recorded.dark, share, n_images)
 
     def shot(self, commands: NDArray, seed: np.random.SeedSequence | np.random.Generator) -> Shot:
         """Take frames of commands, (..., n_segments)."""
@@ -99,7 +99,7 @@ class Camera(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Known:
+class RecordedBench:
     """A bench, and what was recorded and modelled on it before the measurements."""
 
     bench: Bench
@@ -115,13 +115,13 @@ class Known:
         return float(np.hypot(np.sqrt(self.bench.background), self.bench.read_noise))
 
 
-def know_bench(bench: Bench, photons: float, poke: float, *, seed: int) -> Known:
+def know_bench(bench: Bench, photons: float, poke: float, *, seed: int) -> RecordedBench:
     """Record what the methods know of a bench, with photons per pixel of the pupil in each frame."""
     bench = dimmed(bench, photons)
     masked, *darks = np.random.SeedSequence(seed).spawn(1 + _N_DARKS)
     dark = np.mean([bench.dark(draw) for draw in darks], axis=0)
     model = BenchModel.from_images(bench, seed)
-    return Known(
+    return RecordedBench(
         bench, dark, bench.frames(None, masked) - dark, model, poked_frames(bench, model, poke, seed), poke
     )
 
@@ -134,18 +134,18 @@ def dimmed(bench: Bench, photons: float) -> Bench:
     return replace(bench, photons_per_image=total, background=background, read_noise=read_noise)
 
 
-def shots(known: Known, photons: float, commands: NDArray, seed: np.random.SeedSequence) -> list[Shot]:
+def shots(recorded: RecordedBench, photons: float, commands: NDArray, seed: np.random.SeedSequence) -> list[Shot]:
     """Take frames of commands with one image and with two.
 
     `photons` are those per point and image of two; one image gets those of both. On its own the first image would
     be brighter than the mean of the two by the imbalance of the bench.
     """
-    cameras = [Camera.of(known, photons, n_images) for n_images in (1, 2)]
+    cameras = [Camera.of(recorded, photons, n_images) for n_images in (1, 2)]
     return [camera.shot(commands, noise) for camera, noise in zip(cameras, seed.spawn(2), strict=True)]
 
 
 def open_loop_errors(
-    benches: Mapping[str, Known],
+    benches: Mapping[str, RecordedBench],
     situations: Mapping[str, Sequence[Situation]],
     n_screens: Mapping[str, int],
     n_iterations: int,
@@ -160,7 +160,7 @@ def open_loop_errors(
 
 def _errors(
     task: tuple[str, int],
-    benches: Mapping[str, Known],
+    benches: Mapping[str, RecordedBench],
     situations: Mapping[str, Sequence[Situation]],
     n_screens: Mapping[str, int],
     n_iterations: int,
@@ -168,37 +168,39 @@ def _errors(
 ) -> dict[str, NDArray[np.float64]]:
     """Errors of all methods in a situation, (n_screens,); each subtracts its estimate of the flat command."""
     name, row = task
-    known, (rms, photons) = benches[name], situations[name][row]
+    recorded, (rms, photons) = benches[name], situations[name][row]
     draws, noise = np.random.SeedSequence(seed, spawn_key=(row,)).spawn(2)
-    model, bench = known.model, known.bench
+    model, bench = recorded.model, recorded.bench
     commands = segment_screens(bench, rms, n_screens[name], seed=draws)
-    alone, pair = shots(known, photons, commands, noise)
+    alone, pair = shots(recorded, photons, commands, noise)
 
     errors = {}
-    for method, reconstruct in _methods(known, photons, n_iterations).items():
+    for method, reconstruct in _methods(recorded, photons, n_iterations).items():
         n_images = reconstruct.sensor.n_masks
         shot = alone if n_images == 1 else pair
-        counts = np.concatenate([known.flat[np.newaxis, :n_images], shot.counts / shot.share])
+        counts = np.concatenate([recorded.flat[np.newaxis, :n_images], shot.counts / shot.share])
         pistons = model.pistons(reconstruct(counts / model.scale[:n_images]).phase)
         residual = segment_residual(pistons[1:] - pistons[0], commands)
         errors[method] = np.sqrt(np.mean(residual**2, axis=-1))
     return errors
 
 
-def _methods(known: Known, photons: float, n_iterations: int) -> dict[str, Any]:
+def _methods(recorded: RecordedBench, photons: float, n_iterations: int) -> dict[str, Any]:
     """Return the methods that know the design of the mask, the clear frames, and the response to pokes."""
-    one, two, modes = known.model.classic, known.model.shifted, known.model.modes
-    share = photons * np.count_nonzero(known.bench.segments) / known.bench.photons_per_image
-    noise = np.sqrt(share) * known.noise  # of a pixel without light, as in `shots`
+    classic, shifted, modes = recorded.model.classic, recorded.model.shifted, recorded.model.modes
+    share = photons * np.count_nonzero(recorded.bench.segments) / recorded.bench.photons_per_image
+    noise = np.sqrt(share) * recorded.noise  # of a pixel without light, as in `shots`
     # Of maximum likelihood, the first start explains the frames or no start does.
     return {
-        "Linear": poked_linear(one, known.model, known.poked, known.poke),
-        "Arcsine": Arcsine(one, n_iterations=n_iterations),
-        "LikelihoodOne": MaximumLikelihood(one, modes, photons=2 * photons, read_noise=noise * 2**0.5, n_starts=1),
-        "LinearTwo": poked_linear(two, known.model, known.poked, known.poke),
-        "PhaseShifted": PhaseShifted(two, n_iterations=n_iterations),
-        "Accelerated": PhaseShifted(two, n_iterations=n_iterations, accelerate=True),
-        "MaximumLikelihood": MaximumLikelihood(two, n_starts=1, photons=photons, read_noise=noise),
+        "Linear": poked_linear(classic, recorded.model, recorded.poked, recorded.poke),
+        "Arcsine": Arcsine(classic, n_iterations=n_iterations),
+        "LikelihoodOne": MaximumLikelihood(
+            classic, modes, photons=2 * photons, read_noise=noise * 2**0.5, n_starts=1
+        ),
+        "LinearTwo": poked_linear(shifted, recorded.model, recorded.poked, recorded.poke),
+        "PhaseShifted": PhaseShifted(shifted, n_iterations=n_iterations),
+        "Accelerated": PhaseShifted(shifted, n_iterations=n_iterations, accelerate=True),
+        "MaximumLikelihood": MaximumLikelihood(shifted, n_starts=1, photons=photons, read_noise=noise),
     }
 
 
@@ -213,13 +215,15 @@ class Loops(NamedTuple):
         return self.residuals < start / 2
 
 
-def bench_loops(known: Known, situations: Sequence[Situation], n_loops: int, seed: int) -> list[dict[str, Loops]]:
+def bench_loops(
+    recorded: RecordedBench, situations: Sequence[Situation], n_loops: int, seed: int
+) -> list[dict[str, Loops]]:
     """Close linear loops on a bench in each situation, with one image and with two.
 
     The response to pokes calibrates the method, and the mirror is led to its flat command.
     """
     tasks = [(situation, name) for situation in situations for name in _ON_BENCH]
-    loops = sweeps.run(_tuned_on_bench, tasks, known, n_loops, seed, name="bench_loops")
+    loops = sweeps.run(_tuned_on_bench, tasks, recorded, n_loops, seed, name="bench_loops")
     size = len(_ON_BENCH)
     return [
         dict(zip(_ON_BENCH, loops[first:last], strict=True))
@@ -227,17 +231,17 @@ def bench_loops(known: Known, situations: Sequence[Situation], n_loops: int, see
     ]
 
 
-def _tuned_on_bench(task: tuple[Situation, str], known: Known, n_loops: int, seed: int) -> Loops:
+def _tuned_on_bench(task: tuple[Situation, str], recorded: RecordedBench, n_loops: int, seed: int) -> Loops:
     """Choose the gain on a sixth as many screens, and close loops on new ones."""
     (rms, photons), name = task
-    linear = poked_linear(getattr(known.model, _ON_BENCH[name]), known.model, known.poked, known.poke)
-    camera = Camera.of(known, photons, linear.sensor.n_masks)
+    linear = poked_linear(getattr(recorded.model, _ON_BENCH[name]), recorded.model, recorded.poked, recorded.poke)
+    camera = Camera.of(recorded, photons, linear.sensor.n_masks)
     first, then = map(int, np.random.SeedSequence(seed).generate_state(2))
-    few = drifting_pistons(known.bench, rms, max(1, n_loops // 6), first)
-    scores = {gain: typical(_close_loops(known, linear, camera, gain, few, first)) for gain in GAINS}
+    few = drifting_pistons(recorded.bench, rms, max(1, n_loops // 6), first)
+    scores = {gain: typical(_close_loops(recorded, linear, camera, gain, few, first)) for gain in GAINS}
     best = min(scores, key=lambda gain: scores[gain])
-    many = drifting_pistons(known.bench, rms, n_loops, then)
-    return Loops(best, _close_loops(known, linear, camera, best, many, then))
+    many = drifting_pistons(recorded.bench, rms, n_loops, then)
+    return Loops(best, _close_loops(recorded, linear, camera, best, many, then))
 
 
 def drifting_pistons(bench: Bench, rms: float, n_screens: int, seed: int) -> NDArray[np.float64]:
@@ -255,12 +259,12 @@ def drifting_pistons(bench: Bench, rms: float, n_screens: int, seed: int) -> NDA
 
 
 def _close_loops(
-    known: Known, linear: Any, camera: Camera, gain: float, pistons: NDArray, seed: int
+    recorded: RecordedBench, linear: Any, camera: Camera, gain: float, pistons: NDArray, seed: int
 ) -> NDArray[np.float64]:
     """Residuals of loops over their last third, (n_screens,), rad rms over the segments."""
-    model, k = known.model, linear.sensor.n_masks
+    model, k = recorded.model, linear.sensor.n_masks
     noise = np.random.default_rng([seed, 1])  # not that of the screens
-    flat = model.pistons(linear(known.flat[:k] / model.scale[:k]).phase)
+    flat = model.pistons(linear(recorded.flat[:k] / model.scale[:k]).phase)
     mirror = [np.zeros(pistons[:, 0].shape)] * DELAY
     residual = []
     for drifted in pistons.swapaxes(0, 1):
@@ -301,8 +305,8 @@ class Row:
     @property
     def method(self) -> str:
         """Methods in words."""
-        one, two = self.methods
-        return two if one == two else f"{two}; one image: {one}"
+        single, pair = self.methods
+        return pair if single == pair else f"{pair}; one image: {single}"
 
     def error(self, n_images: int) -> str:
         """Error in words; none where at most half of the loops close."""
@@ -328,9 +332,9 @@ def open_rows(
     rows = []
     for bench, cases in errors.items():
         for situation, case in zip(situations[bench], cases, strict=True):
-            one, two = simplest(case, ONE_IMAGE), simplest(case, TWO_IMAGES)
-            means = typical(case[one]), typical(case[two])
-            rows.append(Row(BENCHES[bench], situation, (ONE_IMAGE[one], TWO_IMAGES[two]), means))
+            single, pair = simplest(case, ONE_IMAGE), simplest(case, TWO_IMAGES)
+            means = typical(case[single]), typical(case[pair])
+            rows.append(Row(BENCHES[bench], situation, (ONE_IMAGE[single], TWO_IMAGES[pair]), means))
     return in_order(rows)
 
 
@@ -344,8 +348,10 @@ def loop_rows(situations: Sequence[Situation], loops: Sequence[Mapping[str, Loop
             methods.append(f"linear, gain {tuned[name].gain:g}")
             errors.append(typical(tuned[name].residuals[closed if closed.any() else ~closed]))
             counts.append(int(closed.sum()))
-        one, two = methods
-        rows.append(Row("", situation, (one, two), (errors[0], errors[1]), (counts[0], counts[1]), closed.size))
+        single, pair = methods
+        rows.append(
+            Row("", situation, (single, pair), (errors[0], errors[1]), (counts[0], counts[1]), closed.size)
+        )
     return in_order(rows)
 
 
@@ -394,25 +400,25 @@ def _light(row: Row) -> str:
 
 def draw_comparison(open_loop: Sequence[Row], loops: Sequence[Row]) -> Figure:
     """Errors in open loop and loops that close, with two images and with one."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(7.5, 5), width_ratios=(1.25, 1))
+    figure, (open_axes, loop_axes) = plt.subplots(1, 2, figsize=(7.5, 5), width_ratios=(1.25, 1))
     errors = [row.errors for row in open_loop]
-    _pairs(left, open_loop, errors, two_digits)
+    _pairs(open_axes, open_loop, errors, two_digits)
     room = np.min(errors) / 3, 3 * np.max(errors)  # for the numbers at the markers
-    left.set(xscale="log", xlim=room, title="open loop", xlabel="error (rad rms)")
+    open_axes.set(xscale="log", xlim=room, title="open loop", xlabel="error (rad rms)")
     n_loops = loops[0].n_loops
-    _pairs(right, loops, [row.closed for row in loops], str)
-    right.set(xlim=(-0.1 * n_loops, 1.1 * n_loops), xticks=(0, n_loops / 2, n_loops))
-    right.set(title="closed loop", xlabel=f"loops that close (of {n_loops})")
-    figure.legend(*left.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    _pairs(loop_axes, loops, [row.closed for row in loops], str)
+    loop_axes.set(xlim=(-0.1 * n_loops, 1.1 * n_loops), xticks=(0, n_loops / 2, n_loops))
+    loop_axes.set(title="closed loop", xlabel=f"loops that close (of {n_loops})")
+    figure.legend(*open_axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     return figure
 
 
 def _pairs(axes: Axes, rows: Sequence[Row], values: Sequence[tuple[float, float]], text: Callable) -> None:
     """Mark the values in each row; that with two images is above its marker, that with one image below."""
     places = np.arange(len(rows))[::-1]
-    one, two = np.transpose(values)
-    axes.hlines(places, one, two, color="#999999", lw=2, zorder=1)
-    for (label, style), xs in zip(_MARKERS.items(), (two, one), strict=True):
+    singles, pairs = np.transpose(values)
+    axes.hlines(places, singles, pairs, color="#999999", lw=2, zorder=1)
+    for (label, style), xs in zip(_MARKERS.items(), (pairs, singles), strict=True):
         axes.plot(xs, places, ls="none", label=label, **style)
     for place, (single, pair) in zip(places, values, strict=True):
         alike = text(single) == text(pair)

@@ -222,10 +222,10 @@ def approximation_panels(inputs: Sequence[float], errors: Errors) -> tuple[Curve
     def over_input(values: list[float]) -> list[float]:
         return [value / rms for value, rms in zip(values, inputs, strict=True)]
 
-    wave = {"phase (rad rms)": [one.phase for one in errors[BEST]]}
-    wave |= {name: [one.amplitude for one in errors[name]] for name in (BEST, LITERAL)}
-    steps = {name: over_input([one.two_images for one in some]) for name, some in errors.items()}
-    steps[f"{BEST}, one image"] = over_input([one.one_image for one in errors[BEST]])
+    wave = {"phase (rad rms)": [error.phase for error in errors[BEST]]}
+    wave |= {name: [error.amplitude for error in errors[name]] for name in (BEST, LITERAL)}
+    steps = {name: over_input([error.two_images for error in case_errors]) for name, case_errors in errors.items()}
+    steps[f"{BEST}, one image"] = over_input([error.one_image for error in errors[BEST]])
     return wave, steps
 
 
@@ -267,7 +267,7 @@ def numbers(
         "true_wave_error": two_images,
         "one_step_error": one_step,
     }
-    found = {name: _at_least(error, resolution) for name, error in errors.items()} | {
+    values = {name: _at_least(error, resolution) for name, error in errors.items()} | {
         "pairs_off_by_pi": pairs.off_by_pi,
         "largest_diversity": pairs.determinant[best_pair],
         "best_difference": pairs.difference[best_pair],
@@ -277,11 +277,11 @@ def numbers(
         "claimed_wave_error_error": claimed[1],
     }
     for value, ending in QUOTED.items():
-        one = approximate[BEST][inputs.index(value)]
-        found |= {f"wave_error_{ending}": one.wave, f"step_error_{ending}": one.two_images}
+        quoted = approximate[BEST][inputs.index(value)]
+        values |= {f"wave_error_{ending}": quoted.wave, f"step_error_{ending}": quoted.two_images}
     for name, short in ((BEST, "wave"), (LITERAL, "literal")):
-        found[f"{short}_amplitude_error_05"] = approximate[name][inputs.index(0.5)].amplitude
-    return rounded(found, ".5g")
+        values[f"{short}_amplitude_error_05"] = approximate[name][inputs.index(0.5)].amplitude
+    return rounded(values, ".5g")
 
 
 IDENTITIES = {
@@ -297,30 +297,30 @@ IDENTITIES = {
 """Titles of the identities, by the names of their errors in `numbers`."""
 
 
-def findings(found: Mapping[str, float | str], resolution: float) -> Text:
+def findings(values: Mapping[str, float | str], resolution: float) -> Text:
     """Return the largest error of the equations and that of the common approximation."""
-    worst = max(float(found[name]) for name in IDENTITIES)
+    worst = max(float(values[name]) for name in IDENTITIES)
     how = (
         f"hold to rounding error, {resolution:.0e}" if worst <= resolution else f"have errors of up to {worst:.2g}"
     )
     return Text(
         f"**The equations {how}.** The common approximation is not exact: after one step with two images, the "
-        f"error is {two_digits(float(found['step_error_01']))} rad for an input of 0.1 rad rms."
+        f"error is {two_digits(float(values['step_error_01']))} rad for an input of 0.1 rad rms."
     )
 
 
-def findings_one_image(found: Mapping[str, float | str]) -> Text:
+def findings_one_image(values: Mapping[str, float | str]) -> Text:
     """Return the errors of two images and of one with their true reference waves."""
     return Text(
-        f"For phases of up to {float(found['largest_phase']):.3g} rad, two images have an error of at most "
-        f"{float(found['true_wave_error']):.2g} rad, and one image an error of "
-        f"{two_digits(float(found['one_image_error']))} rad rms."
+        f"For phases of up to {float(values['largest_phase']):.3g} rad, two images have an error of at most "
+        f"{float(values['true_wave_error']):.2g} rad, and one image an error of "
+        f"{two_digits(float(values['one_image_error']))} rad rms."
     )
 
 
-def identities_table(found: Mapping[str, float | str], resolution: float) -> Table:
+def identities_table(values: Mapping[str, float | str], resolution: float) -> Table:
     """Largest error of each identity, from `numbers`."""
-    rows = [[title, _text(float(found[name]), resolution)] for name, title in IDENTITIES.items()]
+    rows = [[title, _text(float(values[name]), resolution)] for name, title in IDENTITIES.items()]
     return Table(["equation of the paper", "largest error"], rows)
 
 

@@ -99,7 +99,7 @@ def amplitude_maps(
         centers = pupil.points[rng.integers(pupil.n_points, size=(n_maps, _SPOTS))]
         squares = np.sum((pupil.points[:, np.newaxis] - centers[:, np.newaxis]) ** 2, axis=-1)
         logarithms = -np.sum(np.exp(-squares / (2 * _WIDTH**2)), axis=-1)
-    return pupil.scatter(np.array([_varied(one, variation) for one in logarithms]), fill=0)
+    return pupil.scatter(np.array([_varied(logarithm, variation) for logarithm in logarithms]), fill=0)
 
 
 def _varied(logarithm: NDArray, variation: float) -> NDArray[np.float64]:
@@ -165,10 +165,12 @@ def _point(
     errors, consistent = {}, {}
     for way in WAYS:
         results = reconstruct(way, sensor, frames, photons)
-        errors[way] = reconstruction_error(sensor.pupil, np.concatenate([one.phase for one in results]), phases)
-        known = [one.consistent for one in results if isinstance(one, LikelihoodReconstruction)]
-        if known:
-            consistent[way] = np.concatenate(known)
+        errors[way] = reconstruction_error(
+            sensor.pupil, np.concatenate([result.phase for result in results]), phases
+        )
+        consistency = [result.consistent for result in results if isinstance(result, LikelihoodReconstruction)]
+        if consistency:
+            consistent[way] = np.concatenate(consistency)
     bounds = [
         cramer_rao(sensor, phase, photons=photons, amplitude=amplitude, amplitude_known=False)
         for phase, amplitude in zip(phases, amplitudes, strict=True)
@@ -193,12 +195,12 @@ def reconstruct(way: str, sensor: ZernikeSensor, frames: NDArray, photons: float
     pair = ZernikeSensor(sensor.pupil, *sensor.masks[:-1], extent=sensor.extent, tolerance=sensor.tolerance)
     batches: list[tuple[NDArray | None, NDArray]] = [(None, frames)]
     if source == "measured":
-        batches = [(np.sqrt(one[-1][sensor.window]), one[np.newaxis]) for one in frames]
+        batches = [(np.sqrt(images[-1][sensor.window]), images[np.newaxis]) for images in frames]
     if method == "PhaseShifted":
-        return [PhaseShifted(pair, amplitude=amplitude)(some[:, :-1]) for amplitude, some in batches]
+        return [PhaseShifted(pair, amplitude=amplitude)(images[:, :-1]) for amplitude, images in batches]
     return [
-        MaximumLikelihood(pair, photons=photons, amplitude=amplitude, n_starts=1)(some[:, :-1])
-        for amplitude, some in batches
+        MaximumLikelihood(pair, photons=photons, amplitude=amplitude, n_starts=1)(images[:, :-1])
+        for amplitude, images in batches
     ]
 
 
@@ -208,14 +210,14 @@ _LINES = {"ignored": ":", "measured": "--", "estimated": "-"}
 def draw_amplitude_errors(curves: Mapping[str, AmplitudeCurves]) -> Figure:
     """Error of each way and the bound against the variation of the amplitude, one panel for each kind."""
     figure, panels = plt.subplots(1, len(curves), figsize=(7, 5), sharey=True, squeeze=False)
-    for axes, (kind, one) in zip(panels[0], curves.items(), strict=True):
-        percent = 100 * one.variations
-        axes.semilogy(percent, one.bound, color="#999999", lw=5, solid_capstyle="round", label="bound", zorder=0)
+    for axes, (kind, curve) in zip(panels[0], curves.items(), strict=True):
+        percent = 100 * curve.variations
+        axes.semilogy(percent, curve.bound, color="#999999", lw=5, solid_capstyle="round", label="bound", zorder=0)
         for name, way in WAYS.items():
             look = LOOKS[way.method]
             style = {"color": look.color, "marker": look.marker, "linestyle": _LINES[way.amplitude], "ms": 6}
             style["markerfacecolor"] = "white" if way.amplitude == "measured" else look.color
-            axes.plot(percent, one.error(name), label=f"{look.name}, amplitude {way.amplitude}", **style)
+            axes.plot(percent, curve.error(name), label=f"{look.name}, amplitude {way.amplitude}", **style)
         axes.set_title(kind, fontsize=10)
         axes.set(xlabel="variation of the amplitude (%)", xlim=(0, None))
     panels[0, 0].set_ylabel("phase error (rad rms)")
@@ -236,7 +238,9 @@ def draw_phase_and_amplitude(
     phases = phase + outside, phase + residual, residual
     amplitudes = amplitude + outside, estimate.amplitude, estimate.amplitude - amplitude
     titles = "true", "estimated", "difference"
-    limit, small = (max(float(np.nanmax(np.abs(one))) for one in some) for some in (phases[:2], phases[2:]))
+    limit, small = (
+        max(float(np.nanmax(np.abs(image))) for image in images) for images in (phases[:2], phases[2:])
+    )
     for axes, image, title in zip(panels[0], phases, titles, strict=True):
         shown = show_phase(axes, image, small if title == "difference" else limit)
         axes.set_title(f"phase,\n{title}", fontsize=10)
@@ -256,7 +260,7 @@ def amplitude_screens(curves: Mapping[str, AmplitudeCurves]) -> dict[str, NDArra
     """Errors of every single screen."""
     variation = "variation of the amplitude"
     return stacked(
-        "kind", {kind: screen_errors(variation, one.variations, one.errors) for kind, one in curves.items()}
+        "kind", {kind: screen_errors(variation, curve.variations, curve.errors) for kind, curve in curves.items()}
     )
 
 
@@ -265,12 +269,12 @@ def findings(curves: Mapping[str, AmplitudeCurves], rms: float, photons: float) 
     any_curves = next(iter(curves.values()))
     place = any_curves.at(0.05)
     ignored = [
-        (one.error(name) / one.bound)[place]
-        for one in curves.values()
+        (curve.error(name) / curve.bound)[place]
+        for curve in curves.values()
         for name, way in WAYS.items()
         if way.amplitude == "ignored"
     ]
-    estimated = max(np.max(one.error(ESTIMATED) / one.bound) for one in curves.values())
+    estimated = max(np.max(curve.error(ESTIMATED) / curve.bound) for curve in curves.values())
     return Text(
         f"**If an amplitude variation of {100 * any_curves.variations[place]:g} % is ignored, the phase error is "
         f"{two_digits(min(ignored))} to {two_digits(max(ignored))} times the photon limit, the Cramér-Rao bound. "
@@ -297,14 +301,14 @@ def findings_example(pupil: Pupil, phase: NDArray, amplitude: NDArray, estimate:
 def costs_table(curves: Mapping[str, AmplitudeCurves]) -> Table:
     """Return the error over the bound, and the share of consistent frame sets, of each way, at two variations."""
     places = [
-        (one, place, f"{kind}, {100 * one.variations[place]:g} %")
-        for kind, one in curves.items()
-        for place in sorted({one.at(0.05), one.at(0.2)})
+        (curve, place, f"{kind}, {100 * curve.variations[place]:g} %")
+        for kind, curve in curves.items()
+        for place in sorted({curve.at(0.05), curve.at(0.2)})
     ]
     rows = []
     for name, way in WAYS.items():
-        ratios = [f"{one.error(name)[place] / one.bound[place]:.2f}" for one, place, _ in places]
-        known = [one.consistent[name][place] for one, place, _ in places if name in one.consistent]
-        consistent = f"{np.mean(known):.0%}" if known else "not tested"
+        ratios = [f"{curve.error(name)[place] / curve.bound[place]:.2f}" for curve, place, _ in places]
+        shares = [curve.consistent[name][place] for curve, place, _ in places if name in curve.consistent]
+        consistent = f"{np.mean(shares):.0%}" if shares else "not tested"
         rows.append([LOOKS[way.method].name, way.amplitude, *ratios, consistent])
     return Table(["method", "amplitude", *(title for _, _, title in places), "consistent"], rows)

@@ -212,7 +212,7 @@ class BenchFit(Result):
         for name, value in values.items():
             _check.choice("values", name, self.model.places)
             numbers[self.model.places[name]] = _check.number(name, value, -_MOST, _MOST)
-        estimates = (replace(one, value=float(values.get(one.name, one.value))) for one in self.estimates)
+        estimates = (replace(old, value=float(values.get(old.name, old.value))) for old in self.estimates)
         return replace(self, estimates=tuple(estimates), model=replace(self.model, values=numbers))
 
     def _values(self) -> Iterator[tuple[str, bool | int | float | str]]:
@@ -222,7 +222,7 @@ class BenchFit(Result):
         """Plain values and arrays, from which `unpacked` makes the fit again."""
         values = {name: getattr(self, name) for name in _PLAIN_OF_FIT}
         values |= {name: getattr(self.model, name) for name in _PLAIN_OF_MODEL}
-        values["estimates"] = [astuple(one) for one in self.estimates]
+        values["estimates"] = [astuple(estimate) for estimate in self.estimates]
         arrays = {name: getattr(self, name) for name in _MAPS_OF_FIT}
         light = {f"light_{name}": array for name, array in vars(self.model.light).items()}
         return values, arrays | light | {"values": self.model.values}
@@ -233,16 +233,16 @@ class BenchFit(Result):
         light = Light(**{name: arrays[f"light_{name}"] for name in Light.__dataclass_fields__})
         settings = {name: values[name] for name in _PLAIN_OF_MODEL} | {"shape": tuple(values["shape"])}
         plain = {name: values[name] for name in _PLAIN_OF_FIT} | {"remarks": tuple(values["remarks"])}
-        estimates = tuple(Estimate(*one) for one in values["estimates"])
+        estimates = tuple(Estimate(*fields) for fields in values["estimates"])
         maps: Any = {name: arrays[name] for name in _MAPS_OF_FIT}
         return cls(estimates, **maps, **plain, model=FrameModel(**settings, light=light, values=arrays["values"]))
 
     def __getitem__(self, name: str) -> Estimate:
         """Estimate of a name."""
-        for one in self.estimates:
-            if one.name == name:
-                return one
-        raise KeyError(f"{name!r}: expected one of {[one.name for one in self.estimates]}")
+        for estimate in self.estimates:
+            if estimate.name == name:
+                return estimate
+        raise KeyError(f"{name!r}: expected one of {[estimate.name for estimate in self.estimates]}")
 
 
 def places_of(arms: Sequence[Mapping[str, float]], n: int, shape: tuple[int, int]) -> NDArray[np.float64]:
@@ -306,18 +306,18 @@ def _coarse(data: Recording, diameter: float, shifts: tuple[float, float]) -> _S
     pupil = Pupil.from_amplitude(np.sqrt(light) * stop, data.n_pixels, threshold=0.3)
     inside = pupil.inside
     scale = flux * np.mean(light[inside])
-    frames = np.stack([centred(one, n) for one in data.counts[2:]]).reshape(-1, 2, n, n) / scale[:, None, None]
-    found: list[tuple[float, _Start]] = []
+    frames = np.stack([centred(image, n) for image in data.counts[2:]]).reshape(-1, 2, n, n) / scale[:, None, None]
+    starts: list[tuple[float, _Start]] = []
     for order in (False, True):
         pair = shifts[::-1] if order else shifts
         for factor in _DIAMETERS:
-            sensor = ZernikeSensor(pupil, *(Dimple(factor * diameter, one) for one in pair), tolerance=1e-4)
+            sensor = ZernikeSensor(pupil, *(Dimple(factor * diameter, shift) for shift in pair), tolerance=1e-4)
             phase = PhaseShifted(sensor, n_iterations=15)(np.maximum(frames, 0)).phase
             waves = aligned(np.where(inside, np.exp(1j * (np.nan_to_num(phase) - data.phases)), 0))
             flat = np.angle(ndimage.gaussian_filter(waves.mean(axis=0), 1.0))
             misfit = float(np.mean((sensor.measure(flat + data.phases) - frames)[..., inside] ** 2))
-            found.append((misfit, _Start(factor * diameter, pair, np.where(inside, flat, 0), order)))
-    return min(found, key=lambda one: one[0])[1]
+            starts.append((misfit, _Start(factor * diameter, pair, np.where(inside, flat, 0), order)))
+    return min(starts, key=lambda start: start[0])[1]
 
 
 def _free(data: Recording, start: _Start) -> list[Free]:
@@ -365,7 +365,7 @@ def _problem(data: Recording, start: _Start, f: int) -> tuple[Problem, NDArray]:
     values = np.zeros(_N_NUMBERS)
     values[names_of(_N_NUMBERS).index("arm 2 flux")] = flux[0]  # the only number that is not free
     division = Light.sharp(light, f)
-    smooth = [ndimage.uniform_filter(one, 3) for one in data.counts]
+    smooth = [ndimage.uniform_filter(image, 3) for image in data.counts]
     free = _free(data, start)
     phase_map = PhaseMap(n, f, _PHASE_PRIOR, data.n_pixels)
     lights = _light_maps(division, f * data.n_pixels)
@@ -396,8 +396,8 @@ def _fitted(
         settings: Any = n_steps, stage.n_inner, stage.enough, lambda step, name=name: report(f"{name} {step}")
         point, converged = minimise(staged, x, *settings)
         if stage.signs and np.mean(point.misfit) > _WRONG * _expected(problem, staged):
-            others = [minimise(staged, one, *settings)[0] for one in _other_signs(point)]
-            point = min(point, *others, key=lambda one: one.cost)
+            others = [minimise(staged, start, *settings)[0] for start in _other_signs(point)]
+            point = min(point, *others, key=lambda end: end.cost)
         if stage.divide:
             problem, x = _divided(data, point, problem.camera.f)
         else:
@@ -413,7 +413,7 @@ def _expected(problem: Problem, staged: Problem) -> float:
 
 def _other_signs(point: Point) -> list[NDArray[np.float64]]:
     """Return the unknowns of a point with all other signs of the focus in the two arms."""
-    focus = [point.problem.n_white + k for k, one in enumerate(point.problem.free) if one.name.endswith("focus")]
+    focus = [point.problem.n_white + k for k, free in enumerate(point.problem.free) if free.name.endswith("focus")]
     signed = np.copysign(np.maximum(np.abs(point.x[focus]), _LEAST_FOCUS), point.x[focus])
     starts = np.repeat(point.x[None], 3, axis=0)
     starts[:, focus] = signed * [(-1, -1), (-1, 1), (1, -1)]
@@ -424,7 +424,8 @@ def _staged(data: Recording, problem: Problem, stage: _Stage) -> Problem:
     """Return the problem with the noise and the free numbers of a stage."""
     farthest = _FARTHEST if stage.focus else 0.0
     free = [
-        one._replace(low=-farthest, high=farthest) if one.name.endswith("focus") else one for one in problem.free
+        number._replace(low=-farthest, high=farthest) if number.name.endswith("focus") else number
+        for number in problem.free
     ]
     level = stage.allowed * data.light[1][0]
     return replace(problem, weights=allowing(problem.weights, level), free=free)
@@ -482,7 +483,7 @@ def _result(data: Recording, point: Point, converged: bool, is_reversed: bool) -
     scale = max(1.0, float(np.mean(misfit)))
     spread = Eliminated(point).covariance(point, _changes(data, point), scale)
     values = point.x[point.problem.n_white :]
-    kinds = [one.kind for one in point.problem.free]
+    kinds = [free.kind for free in point.problem.free]
     blur = kinds.index("blur")
     spread[blur, blur] += (MISSED * _PIXEL / point.problem.camera.f**2 / (2 * values[blur])) ** 2
     passed = math.exp(-2 * (math.pi * values[blur]) ** 2)  # by the blur, at one cycle per pixel
@@ -490,13 +491,13 @@ def _result(data: Recording, point: Point, converged: bool, is_reversed: bool) -
     spread += np.diag(np.square(missed))
     sigma = np.sqrt(np.diagonal(spread)).tolist()
     estimates = tuple(
-        Estimate(one.name, value, error, not one.low < value < one.high)
-        for one, value, error in zip(point.problem.free, values.tolist(), sigma, strict=True)
+        Estimate(free.name, value, error, not free.low < value < free.high)
+        for free, value, error in zip(point.problem.free, values.tolist(), sigma, strict=True)
     )
     remarks = tuple(_remarks(data, point, misfit, estimates, is_reversed))
-    flat, light = (one[PAD:-PAD, PAD:-PAD] for one in (point.phase_means, point.light_means))
+    flat, light = (means[PAD:-PAD, PAD:-PAD] for means in (point.phase_means, point.light_means))
     camera, fitted_light = point.problem.camera, replace(point.problem.light, start=point.light)
-    places = {one.name: at for one, at in zip(point.problem.free, point.problem.places, strict=True)}
+    places = {free.name: at for free, at in zip(point.problem.free, point.problem.places, strict=True)}
     grids = camera.shape, camera.n_pixels, camera.f, camera.largest
     model = FrameModel(*grids, fitted_light, point.values, places)
     return BenchFit(estimates, spread, flat, light, misfit, data.noise, data.gain, bool(converged), remarks, model)
@@ -509,9 +510,9 @@ def _remarks(
     out = []
     if is_reversed:
         out.append("The images are in reverse order: the first image has the second of the phase shifts given.")
-    for one, of in zip(estimates, point.problem.free, strict=True):
-        if one.at_limit and not (of.name in _PHYSICAL and one.value <= of.low):
-            out.append(f"{one.name} stands at a limit of the fit.")
+    for estimate, free in zip(estimates, point.problem.free, strict=True):
+        if estimate.at_limit and not (free.name in _PHYSICAL and estimate.value <= free.low):
+            out.append(f"{estimate.name} stands at a limit of the fit.")
     states = misfit[2:].reshape(-1, 2).mean(axis=1)
     typical = float(np.median(states))
     for state, misfit in enumerate(states):
@@ -521,7 +522,7 @@ def _remarks(
                 "frames are wrong."
             )
     level = data.light[1][0]
-    for one in estimates:
-        if one.name.endswith("background") and abs(one.value) > max(5 * one.sigma, 3e-3 * level):
-            out.append(f"{one.name} is {one.value:.4g} counts: the dark does not belong to the frames.")
+    for estimate in estimates:
+        if estimate.name.endswith("background") and abs(estimate.value) > max(5 * estimate.sigma, 3e-3 * level):
+            out.append(f"{estimate.name} is {estimate.value:.4g} counts: the dark does not belong to the frames.")
     return out

@@ -105,7 +105,7 @@ class Camera:
         axis = (np.arange(size) - (size - 1) / 2) / (n_pixels * f)
         spread = math.sqrt(2) * (inner + size) / (n_pixels * f)
         self._axes, self._spread = (axis[self.window[0]], axis), spread
-        self.planes = tuple(_plane(one, largest, spread, real) for one in self._axes)
+        self.planes = tuple(_plane(axis, largest, spread, real) for axis in self._axes)
         frequency = fft.fftfreq(size) * f  # cycles per pixel
         self.defocus = self.defocus_at(frequency[None, :], frequency[:, None])
         half = fft.rfftfreq(size) * f
@@ -123,8 +123,11 @@ class Camera:
     @cached_property
     def groups(self) -> list[_Group]:
         """Exposures with the same optical path and mask."""
-        kinds = list(dict.fromkeys((one.arm, one.mask) for one in self.exposures))
-        numbers = [[k for k, one in enumerate(self.exposures) if (one.arm, one.mask) == kind] for kind in kinds]
+        kinds = list(dict.fromkeys((exposure.arm, exposure.mask) for exposure in self.exposures))
+        numbers = [
+            [k for k, exposure in enumerate(self.exposures) if (exposure.arm, exposure.mask) == kind]
+            for kind in kinds
+        ]
         return [
             _Group(*kind, images, [self.exposures[k].state for k in images])
             for kind, images in zip(kinds, numbers, strict=True)
@@ -171,7 +174,7 @@ class Camera:
         """Operators (3, q, r) of the dimple's light: itself, and its derivatives by focus and diameter."""
         dimple = Dimple(diameter, 0.0)
         nodes = [make(dimple, self._spread, _TOLERANCE, 1.0) for make in (_quadrature, _rim)]
-        u, v = (np.concatenate(both) for both in zip(*(one[:2] for one in nodes), strict=True))
+        u, v = (np.concatenate(both) for both in zip(*(node[:2] for node in nodes), strict=True))
         disc, rim = (np.zeros(u.size) for _ in range(2))
         disc[: nodes[0][2].size], rim[nodes[0][2].size :] = nodes[0][2], nodes[1][2]
         defocus = self.defocus_at(u / self.n_pixels, v / self.n_pixels)
@@ -200,8 +203,8 @@ def pooled(fine: NDArray, f: int) -> NDArray[np.float64]:
 def symbol(series: Sequence[float], size: int) -> NDArray[np.float64]:
     """Spectrum, (size, size // 2 + 1), of a filter whose spectrum along each axis is a series of cosines."""
     full, half = (
-        np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * one), series)
-        for one in (fft.fftfreq(size), fft.rfftfreq(size))
+        np.polynomial.chebyshev.chebval(np.cos(2 * np.pi * frequencies), series)
+        for frequencies in (fft.fftfreq(size), fft.rfftfreq(size))
     )
     return np.multiply.outer(full, half)
 
@@ -212,8 +215,8 @@ def _plane(axis: NDArray, largest: float, spread: float, real: Any) -> Plane:
     u, v, _ = _quadrature(Dimple(largest, 0.0), spread, _TOLERANCE)
     waves = _spectra(((along, axis),) * 2, u, v)
     functions, strength, _ = np.linalg.svd(np.concatenate([waves.real, waves.imag], 1), full_matrices=False)
-    kept = functions[:, strength > _TOLERANCE * strength[0]]
-    return Plane(*(one.astype(real) for one in (along, along, kept)))
+    combine = functions[:, strength > _TOLERANCE * strength[0]]
+    return Plane(*(part.astype(real) for part in (along, along, combine)))
 
 
 class Coefficients(NamedTuple):
@@ -268,7 +271,7 @@ class _Spline:
         )
         middle = (camera.size - 1) / 2
         (rows, along_y, slope_y), (columns, along_x, slope_x) = (
-            _weights(one * f + middle, camera.size, f) for one in (down, across)
+            _weights(places * f + middle, camera.size, f) for places in (down, across)
         )
         self._index = (rows[:, :, None] * camera.size + columns[:, None, :]).reshape(len(rows), -1)
         self._starts = np.arange(len(rows) + 1) * self._index.shape[1]
@@ -303,7 +306,7 @@ class _Spline:
 
     def slopes(self, image: NDArray) -> NDArray:
         """Derivatives by row, column, rotation and magnification, (4, ny, nx)."""
-        down, across = (one @ image.ravel() for one in self._gradient)
+        down, across = (gradient @ image.ravel() for gradient in self._gradient)
         return np.stack([(down * dy + across * dx).reshape(self.shape) for dy, dx in self._moves])
 
 
@@ -356,15 +359,15 @@ class Operators:
         real, self.values = camera.real, values.copy()
         self.arms, self.masks = named(values)
         self.coefficients = coefficients(self.masks)
-        used = {one.arm for one in camera.exposures}
+        used = {exposure.arm for exposure in camera.exposures}
         self.transfer, self.spread, self.splines, self.cores = ({} for _ in range(4))
         spread = {focus: camera.spread_at(focus) for focus in {self.arms[number]["focus"] for number in used}}
         for number in used:
             arm = self.arms[number]
             self.transfer[number] = camera.complex(np.exp(-1j * arm["focus"] * camera.defocus))
-            self.spread[number] = [np.asarray(one, real) for one in spread[arm["focus"]]]
+            self.spread[number] = [np.asarray(chirp, real) for chirp in spread[arm["focus"]]]
             self.splines[number] = _Spline(camera, [arm[name] for name in _PLACE])
-        for number in {one.arm for one in camera.exposures if one.mask is not None}:
+        for number in {exposure.arm for exposure in camera.exposures if exposure.mask is not None}:
             self.cores[number] = camera.complex(camera.cores(self.masks["diameter"], self.arms[number]["focus"]))
         blur = np.exp(-2 * (np.pi * self.masks["blur"]) ** 2 * camera.squares)
         self.blur = (camera.prefilter * blur).astype(real)
@@ -375,10 +378,11 @@ class Operators:
         out = copy(self)
         out.blur = self.blur.astype(np.float32)
         out.transfer, out.cores = (
-            {arm: one.astype(np.complex64) for arm, one in parts.items()} for parts in (self.transfer, self.cores)
+            {arm: part.astype(np.complex64) for arm, part in parts.items()}
+            for parts in (self.transfer, self.cores)
         )
         out.spread = {arm: [chirp.astype(np.float32) for chirp in pair] for arm, pair in self.spread.items()}
-        out.splines = {arm: one.single for arm, one in self.splines.items()}
+        out.splines = {arm: spline.single for arm, spline in self.splines.items()}
         return out
 
 
@@ -403,7 +407,7 @@ class Linearised:
     def __init__(self, camera: Camera, maps: Maps, values: NDArray) -> None:
         self.camera, self.optics = camera, camera.optics(values)
         self.arms, self.masks = self.optics.arms, self.optics.masks
-        mean, rest, phase = (one.astype(camera.real) for one in maps[:3])
+        mean, rest, phase = (values.astype(camera.real) for values in maps[:3])
         self.maps = Maps(mean, rest, phase, maps.cells)
         self._rest = self._spectrum_of(rest)
         cells = np.zeros((camera.size,) * 2, bool)
@@ -411,7 +415,7 @@ class Linearised:
         self._smooth = (~ndimage.binary_dilation(cells) / 24).astype(camera.real)
         self._wave = np.exp(1j * phase)
         self._spectra, self._inputs = self._source(mean * self._wave * camera.turns)
-        self._parts = [self._part(one) for one in camera.groups]
+        self._parts = [self._part(group) for group in camera.groups]
         self.images = np.empty((len(camera.exposures), *camera.shape), camera.real)
         for group, part in zip(camera.groups, self._parts, strict=True):
             arm = self.arms[group.arm]
@@ -509,7 +513,7 @@ class Linearised:
         camera, optics = self.camera, self.optics
         pixels = np.asarray(pixels, camera.real)
         lead, unresolved = pixels.shape[:-3], np.zeros((), self._rest.dtype)
-        spectra, inputs = (np.zeros((*lead, *one.shape), one.dtype) for one in (self._spectra, self._inputs))
+        spectra, inputs = (np.zeros((*lead, *array.shape), array.dtype) for array in (self._spectra, self._inputs))
         for group, part in zip(camera.groups, self._parts, strict=True):
             arm = group.arm
             back = optics.splines[arm].adjoint(self.arms[arm]["flux"] * pixels[..., group.images, :, :])
@@ -548,7 +552,7 @@ class Linearised:
         group, parts = next(
             pair for pair in zip(camera.groups, self._parts, strict=True) if index in pair[0].images
         )
-        own: Any = [each if each is None else each[group.images.index(index)] for each in parts]
+        own: Any = [values if values is None else values[group.images.index(index)] for values in parts]
         part = _Part(*own)
         flux, spread = self.arms[group.arm]["flux"], optics.spread[group.arm][1]
         zero = np.zeros(camera.shape)

@@ -179,18 +179,19 @@ class Problem:
         """Places of each free number in the vector of all."""
         index = {name: place for place, name in enumerate(names_of(len(self.values)))}
         return [
-            [index[name if arm is None else f"arm {arm} {name}"] for arm, name in one.places] for one in self.free
+            [index[name if arm is None else f"arm {arm} {name}"] for arm, name in free.places]
+            for free in self.free
         ]
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Limits of the free numbers, (n_free, 2)."""
-        return np.array([(one.low, one.high) for one in self.free]).reshape(-1, 2)
+        return np.array([(free.low, free.high) for free in self.free]).reshape(-1, 2)
 
     @cached_property
     def prior(self) -> tuple[NDArray, NDArray]:
         """Means and inverse standard deviations of the priors of the free numbers."""
-        return np.array([one.value for one in self.free]), np.array([1 / one.sigma for one in self.free])
+        return np.array([free.value for free in self.free]), np.array([1 / free.sigma for free in self.free])
 
     @cached_property
     def single(self) -> Problem:
@@ -206,7 +207,7 @@ class Problem:
 
     @cached_property
     def n_white(self) -> int:
-        return sum(one.size**2 for one in self.maps)
+        return sum(unknown.size**2 for unknown in self.maps)
 
     @property
     def start(self) -> NDArray[np.float64]:
@@ -214,23 +215,23 @@ class Problem:
 
     def split(self, x: NDArray) -> tuple[list[NDArray], NDArray]:
         """White maps and free numbers."""
-        ends = np.cumsum([one.size**2 for one in self.maps])
+        ends = np.cumsum([unknown.size**2 for unknown in self.maps])
         *white, free = np.split(x, ends, axis=-1)
-        shapes = [(*x.shape[:-1], one.size, one.size) for one in self.maps]
-        return [one.reshape(shape) for one, shape in zip(white, shapes, strict=True)], free
+        shapes = [(*x.shape[:-1], unknown.size, unknown.size) for unknown in self.maps]
+        return [values.reshape(shape) for values, shape in zip(white, shapes, strict=True)], free
 
     def joined(self, phase: NDArray, light: NDArray) -> NDArray[np.float64]:
         """Adjoint of the maps, with zeros for the free numbers."""
-        parts = [self.phase_map.adjoint(phase), *(one.adjoint(light) for one in self.light_maps)]
+        parts = [self.phase_map.adjoint(phase), *(light_map.adjoint(light) for light_map in self.light_maps)]
         lead = phase.shape[:-2]
-        white = [one.reshape(*lead, -1) for one in parts]
+        white = [part.reshape(*lead, -1) for part in parts]
         return np.concatenate([*white, np.zeros((*lead, len(self.free)))], axis=-1)
 
     def light_change(self, white: Sequence[NDArray]) -> NDArray[np.float64]:
         """Change of the light on the fine grid."""
         pairs = zip(white[1:], self.light_maps, strict=True)
         zero = np.zeros((*white[0].shape[:-2], *self.light.start.shape), white[0].dtype)
-        return sum((of.fine(one) for one, of in pairs), zero)
+        return sum((light_map.fine(change) for change, light_map in pairs), zero)
 
 
 class Point:
@@ -248,7 +249,7 @@ class Point:
         self.residuals = problem.weights * (self.model.images - problem.counts)
         self.excess = (free - problem.prior[0]) * problem.prior[1]
         parts = self.residuals, x[: problem.n_white], self.excess
-        self.cost = sum(float(np.vdot(one, one)) for one in parts) / 2
+        self.cost = sum(float(np.vdot(part, part)) for part in parts) / 2
 
     def moved(self, change: NDArray) -> Point:
         """Return the point after a change of the unknowns; no number passes a limit."""
@@ -344,7 +345,7 @@ class Matrix:
         problem = self.problem
         white, free = problem.split(np.asarray(d, problem.camera.real))
         light = problem.light_change(white)
-        mean, rest = (light * one for one in self._slopes)
+        mean, rest = (light * slope for slope in self._slopes)
         changes = problem.weights * self.model.apply(mean, rest, problem.phase_map.fine(white[0]))
         if free.any():
             for index, (which, slopes) in enumerate(self.columns):
@@ -386,25 +387,25 @@ class Matrix:
         rng = np.random.default_rng(0)  # the choice hardly changes the number of steps
         problem, zero, (mean, rest) = self.problem, self._zero, self._slopes
         out = []
-        for number, one in enumerate(problem.maps):
-            where: NDArray = one.where if isinstance(one, LightMap) else self._light > 0.3
+        for number, unknown in enumerate(problem.maps):
+            where: NDArray = unknown.where if isinstance(unknown, LightMap) else self._light > 0.3
             probe = rng.choice([-1.0, 1.0], where.shape) * where
             images = self.model.apply(*((probe * mean, probe * rest, zero) if number else (zero, zero, probe)))
-            factor, response = np.ones((one.size,) * 2), np.zeros((one.size, one.size // 2 + 1))
-            if number and not one.prior.exponent:
+            factor, response = np.ones((unknown.size,) * 2), np.zeros((unknown.size, unknown.size // 2 + 1))
+            if number and not unknown.prior.exponent:
                 gain = _POINTS * np.sum((problem.weights * images) ** 2) / np.sum(self._local, where=where)
-                factor[: one.n, : one.n] = np.sqrt(1 + gain * one.prior.rms**2 * self._local * where)
+                factor[: unknown.n, : unknown.n] = np.sqrt(1 + gain * unknown.prior.rms**2 * self._local * where)
             else:
                 maps = self.model.adjoint(problem.weights**2 * images)
                 answer = (maps.mean * mean + maps.rest * rest) * where if number else maps.phase
-                response = self._response(probe, answer, one)
+                response = self._response(probe, answer, unknown)
                 if number:
                     near = ndimage.gaussian_filter(self._local, problem.camera.f)
-                    factor[: one.n, : one.n] = np.clip(near / np.median(near[where]), *_WEIGHED) ** _POWER
-            white = [rng.normal(size=(of.size,) * 2) * (of is one) for of in problem.maps]
+                    factor[: unknown.n, : unknown.n] = np.clip(near / np.median(near[where]), *_WEIGHED) ** _POWER
+            white = [rng.normal(size=(map_.size,) * 2) * (map_ is unknown) for map_ in problem.maps]
             white[number] = fft.irfft2(fft.rfft2(white[number]) / np.sqrt(1 + response), s=factor.shape) / factor
-            d = np.concatenate([*(each.ravel() for each in white), np.zeros(len(problem.free))])
-            out.append((factor, float(d @ self.product(d)) / one.size**2 * (1 + response)))
+            d = np.concatenate([*(values.ravel() for values in white), np.zeros(len(problem.free))])
+            out.append((factor, float(d @ self.product(d)) / unknown.size**2 * (1 + response)))
         return [(factor.astype(np.float32), spectrum.astype(np.float32)) for factor, spectrum in out]
 
     @cached_property
@@ -449,8 +450,8 @@ class Matrix:
     def _filtered(self, d: NDArray, power: int) -> list[NDArray]:
         white, _ = self.problem.split(np.asarray(d, self.problem.camera.real))
         out = []
-        for one, (factor, spectrum) in zip(white, self.filters, strict=True):
-            filtered = fft.irfft2(fft.rfft2(one * factor**power) * spectrum**power, s=factor.shape)
+        for values, (factor, spectrum) in zip(white, self.filters, strict=True):
+            filtered = fft.irfft2(fft.rfft2(values * factor**power) * spectrum**power, s=factor.shape)
             out.append((filtered * factor**power).reshape(*d.shape[:-1], -1))
         return out
 
@@ -491,8 +492,8 @@ class Matrix:
             out = np.concatenate([self.product(few) for few in np.array_split(d, -(-len(d) // _TOGETHER))])
             return out + damping * self.scale(d) if damping else out
 
-        def free(one: NDArray) -> NDArray:
-            return np.where(held, 0, one)
+        def free(vectors: NDArray) -> NDArray:
+            return np.where(held, 0, vectors)
 
         r = free(np.atleast_2d(right))
         x, z = np.zeros_like(r), free(self.precondition(r, held))
@@ -533,7 +534,7 @@ def minimise(
             promised = -float(point.gradient @ change) / 2
             own = following.own(change) if following else 0.0
             shares = _SHARES if following else (0.0,)
-            trial = min((point.moved(change - share * own) for share in shares), key=lambda one: one.cost)
+            trial = min((point.moved(change - share * own) for share in shares), key=lambda tried: tried.cost)
             gain = point.cost - trial.cost
             if gain >= 0 or promised < _SETTLED:
                 break
@@ -564,7 +565,7 @@ class Eliminated:
         followed, right = np.zeros((len(along), n_all)), matrix.back(along)
         if before:
             followed[:, :n] = before.maps / self._unit[:, None]
-            right -= [matrix.product(one) for one in followed]
+            right -= [matrix.product(direction) for direction in followed]
         followed += matrix.solve(right, held, _N_FOLLOWED[before is not None], 0.01)
         self._effects = along - matrix.change(followed)
         self._x, self._e = followed[:, :n], self._effects.reshape(len(along), -1)
@@ -598,13 +599,13 @@ class Eliminated:
         """
         inverse, matrix, n = self._inverse, point.matrix, point.problem.n_white
         scores = _block_sums(np.sum(point.residuals * self._effects, axis=1))
-        seen = np.diagonal(inverse @ (scores @ scores.T + self._known) @ inverse) / np.diagonal(inverse)
-        grow = np.sqrt(np.maximum(scale, seen)) / self._unit
+        spread = np.diagonal(inverse @ (scores @ scores.T + self._known) @ inverse) / np.diagonal(inverse)
+        grow = np.sqrt(np.maximum(scale, spread)) / self._unit
         y = matrix.solve(matrix.back(changes), np.arange(len(point.x)) >= n, _N_CHANGES, 0.01)
         alone = (changes - matrix.change(y)).reshape(len(changes), -1)
         moved = inverse @ (self._e @ alone.T + self._x @ y[:, :n].T)
         squares = np.mean(moved**2, axis=1) / np.diagonal(inverse)
-        kinds = np.array([one.kind for one in point.problem.free])
+        kinds = np.array([free.kind for free in point.problem.free])
         alike = np.array([np.mean(squares[kinds == kind]) for kind in kinds])
         missed = MISSED**2 * alike * np.diagonal(inverse) / self._unit**2
         return inverse * np.outer(grow, grow) + np.diag(missed)

@@ -458,14 +458,14 @@ def numbers(
     *zeros, _, repaired = variants
     widest = max(zeros, key=lambda name: variants[name].sensor.extent)
     usual, wide = methods["GerchbergSaxton"].sensor, variants[widest].sensor
-    tenth, half, one = (_nearest(curves, value) for value in (0.1, 0.5, 1.0))
+    tenth, half, full = (_nearest(curves, value) for value in (0.1, 0.5, 1.0))
     offset, offset_widest = mean["GerchbergSaxton"][tenth], by_width.mean(widest)[0]
     alike = _alike_up_to(curves)
     low = (rms > 0) & (rms <= 0.3)
     with_wraps = np.mean(curves.wrapped > 0, axis=1)
-    recovered = {name: curves.recovered(name, threshold)[one] for name in curves.errors}
+    recovered = {name: curves.recovered(name, threshold)[full] for name in curves.errors}
     recovered |= {name: descents.recovered(name, threshold)[0] for name in descents.errors}
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         "n_screens": curves.strehl.shape[1],
         "saxton_limit": limits["GerchbergSaxton"].value,
         "gain": gain.value,
@@ -476,9 +476,9 @@ def numbers(
         "modes_recovered_at_1": recovered["GradientDescent"],
         "points_recovered_at_1": recovered["GradientDescentPoints"],
         "recovered_at_1": recovered["PhaseShifted"],
-        "strehl_at_1": curves.strehl[one].mean(),
+        "strehl_at_1": curves.strehl[full].mean(),
         "wrapped_screens_at_05": with_wraps[half],
-        "wrapped_screens_at_1": with_wraps[one],
+        "wrapped_screens_at_1": with_wraps[full],
         "wrap_onset": _wrap_onset(curves),
         "saxton_extent": usual.extent,
         "saxton_iterations": methods["GerchbergSaxton"].settings.n_iterations,
@@ -496,6 +496,6 @@ def numbers(
         "rank": methods["PhaseShifted"].sensor.rank,
     }
     for name, short in _SHORT.items():
-        found[f"{short}_limit"] = limits[name].value
-    found["saxton_model_limit_longer"] = longer.value
-    return rounded(found)
+        values[f"{short}_limit"] = limits[name].value
+    values["saxton_model_limit_longer"] = longer.value
+    return rounded(values)

@@ -180,9 +180,9 @@ def draw_dimple_diameter(curves: Mapping[int, DiameterCurves], threshold: float,
         axes.fill_between(curve.diameters, low, high, color=look.color, alpha=0.2, lw=0, label=scatter)
         _diameters(axes, curve.diameters[-1], claimed)
         axes.set_ylabel("error (rad rms)")
-    for index, ((number, other), style) in enumerate(zip(others, OTHER_STYLES[1:], strict=False)):
+    for index, ((number, longer), style) in enumerate(zip(others, OTHER_STYLES[1:], strict=False)):
         style = style | {"ms": 5, "mfc": "#ffffff" if index % 2 else None, "label": f"{number} iterations"}
-        log.plot(other.diameters, np.maximum(other.mean(name), floor), **style)
+        log.plot(longer.diameters, np.maximum(longer.mean(name), floor), **style)
     limit = threshold * curve.rms[0]
     log.axhline(limit, color="#555555", lw=1)
     end = min(1.4 * claimed, curve.diameters[-1])
@@ -358,7 +358,7 @@ def numbers(
     paper = by_method[ITERATION]
     allowed = threshold * paper.rms[0]
     limit, last = (list(limits.values())[place] for place in (0, -1))
-    found: dict[str, Any] = {
+    values: dict[str, Any] = {
         "iterations": next(iter(by_iterations)),
         "diameter_5_percent": limit.value,
         "diameter_5_percent_longest": last.value,
@@ -370,4 +370,4 @@ def numbers(
         **{f"claim17_{short}_rise": _rise(by_method[name], name, allowed) for name, short in SHORT.items()},
         "longest": list(by_iterations)[-1],
     }
-    return rounded(found, ".4g")
+    return rounded(values, ".4g")

@@ -230,8 +230,8 @@ def ratio_table(curves: Mapping[float, PhotonCurves]) -> Table:
         ["dimple, input", *(f"{value:g} photons" for value in photons)],
         [
             [f"{diameter:g} λ/D, {rms:g} rad rms", *cells]
-            for diameter, one in curves.items()
-            for rms, cells in zip(one.rms, _cells(*map(one.ratio, TABLED)), strict=True)
+            for diameter, case in curves.items()
+            for rms, cells in zip(case.rms, _cells(*map(case.ratio, TABLED)), strict=True)
         ],
     )
 
@@ -263,14 +263,14 @@ def findings(curves: PhotonCurves, diameter: float) -> Text:
 def findings_wide(curves: Mapping[float, PhotonCurves]) -> Text:
     """Return the errors at the largest input with most photons, by the diameter of the dimples."""
     sentences = []
-    for diameter, one in curves.items():
-        row, column = np.argmax(one.rms), np.argmax(one.photons)
-        likely, shifted = (f"{one.ratio(name)[row, column]:.3g}" for name in TABLED)
-        worst = np.max((one.errors["PhaseShifted"] / one.bound)[row, column])
+    for diameter, case in curves.items():
+        row, column = np.argmax(case.rms), np.argmax(case.photons)
+        likely, shifted = (f"{case.ratio(name)[row, column]:.3g}" for name in TABLED)
+        worst = np.max((case.errors["PhaseShifted"] / case.bound)[row, column])
         sentences.append(
-            f"- **Dimples of {diameter:g} λ/D**, at {one.rms[row]:g} rad rms and {one.photons[column]:g} photons: "
-            f"the median error is {likely} times the bound with maximum likelihood and {shifted} times with the "
-            f"iteration, whose worst screen has {worst:.3g} times the bound."
+            f"- **Dimples of {diameter:g} λ/D**, at {case.rms[row]:g} rad rms and {case.photons[column]:g} "
+            f"photons: the median error is {likely} times the bound with maximum likelihood and {shifted} times "
+            f"with the iteration, whose worst screen has {worst:.3g} times the bound."
         )
     return Text("\n".join(sentences))
 

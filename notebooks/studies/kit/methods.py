@@ -67,10 +67,10 @@ def own_reconstructors(paths: Sequence[str], reconstructors: Mapping[str, Any], 
     added = {method.__name__: method for method in RECONSTRUCTORS}
     for name in (*PAPER, *OWN_CHAPTER):
         added.pop(name, None)
-    one, two = (reconstructors[name].sensor for name in ("Arcsine", "PhaseShifted"))
+    classic, shifted = (reconstructors[name].sensor for name in ("Arcsine", "PhaseShifted"))
     offered = {"modes": modes, "n_iterations": reconstructors["PhaseShifted"].settings.n_iterations}
     return {
-        name: method(two if _accepts_two_masks(method) else one, **_asked(method, offered))
+        name: method(shifted if _accepts_two_masks(method) else classic, **_asked(method, offered))
         for name, method in (added | _own_classes(paths)).items()
     }
 
@@ -110,9 +110,9 @@ def _own_classes(paths: Sequence[str]) -> dict[str, Any]:
     own: dict[str, Any] = {}
     for path in paths:
         method = package.get(path) or _load(path)
-        taken = (*PAPER, MODEL_SAXTON, *own)
-        if method.__name__ in taken:
-            raise ValueError(f"path = {path!r}: expected a name other than {', '.join(taken)}")
+        reserved = (*PAPER, MODEL_SAXTON, *own)
+        if method.__name__ in reserved:
+            raise ValueError(f"path = {path!r}: expected a name other than {', '.join(reserved)}")
         own[method.__name__] = method
     return own
 

@@ -93,21 +93,21 @@ def _check_fields(name: str, values: Any, fields: Fields) -> None:
     if "kind" in values and fields.kinds:
         _check_value(f"{name}.kind", values["kind"], tuple(fields.kinds))
     kind = values.get("kind", next(iter(fields.kinds), ""))
-    known = fields.of_kind(kind)
+    limits = fields.of_kind(kind)
     for key, value in values.items():
-        if key not in known:
-            similar = get_close_matches(str(key), known, n=1)
-            expected = f"did you mean {similar[0]!r}?" if similar else f"expected one of {', '.join(known)}"
+        if key not in limits:
+            similar = get_close_matches(str(key), limits, n=1)
+            expected = f"did you mean {similar[0]!r}?" if similar else f"expected one of {', '.join(limits)}"
             raise ValueError(
                 f"unknown parameter {f'{name}.{key}'!r}{f' of kind {kind!r}' if kind else ''}: {expected}"
             )
-        _check_value(f"{name}.{key}", value, known[key])
+        _check_value(f"{name}.{key}", value, limits[key])
 
 
 def typed(value: Any, limits: Any) -> Any:
     """Return a checked value, with floats in place of integers where the limits are floats."""
     if isinstance(limits, Fields):
-        return {name: typed(one, limits.every()[name]) for name, one in value.items()}
+        return {name: typed(field, limits.every()[name]) for name, field in value.items()}
     if isinstance(value, list):
         return [typed(item, limits[0]) for item in value]
     return float(value) if isinstance(example(limits), float) else value
@@ -117,7 +117,7 @@ def example(limits: Any) -> Any:
     """Return a value of the type that single values within some limits have: a float if one limit is a float."""
     if isinstance(limits, type):
         return limits()
-    return next((one for one in limits or () if isinstance(one, float)), limits[0] if limits else None)
+    return next((limit for limit in limits or () if isinstance(limit, float)), limits[0] if limits else None)
 
 
 _CUT = {"obstruction": (0.0, 0.9), "vanes": [[(-6.2832, 6.2832)], ...]}

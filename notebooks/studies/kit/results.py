@@ -47,7 +47,7 @@ def publish(figure: Figure, name: str, screens: Mapping[str, ArrayLike] | None =
     if folder:
         contents = {".csv": csv_bytes(drawn_columns(figure))}
         contents |= {} if screens is None else {f"{SCREENS}.csv": csv_bytes(screens)}
-        contents |= {f".{kind}.png": picture_bytes(one, "png") for kind, one in variants(figure).items()}
+        contents |= {f".{kind}.png": picture_bytes(variant, "png") for kind, variant in variants(figure).items()}
     for kind in METADATA if folder else ("png",):  # the first one fixes the layout
         contents[f".{kind}"] = picture_bytes(figure, kind)
     if folder:

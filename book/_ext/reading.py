@@ -13,6 +13,7 @@ from studies.kit.results import published
 CARD = "card-"  # with which the ids of the cards begin
 FOLD = "Code of this page"
 COMPUTING = "This code computes the numbers of the {}:"
+STUDY = "from studies import "  # with which the removed cell begins that the code of the page needs
 FOLDED = "fold"  # tag of a cell that computes and yet goes into the fold
 
 
@@ -40,7 +41,8 @@ def put_in_order(notebook: NotebookNode) -> None:
         elif cell.outputs or tagged(cell, "remove-cell"):
             drawn = drawn or bool(published(cell.source))
             cells.append(without_code(cell) if tagged(cell, "hide-input") else cell)
-    notebook.cells = [*cells, *computing, *([fold(code)] if code else [])]
+    whole = [cell for cell in notebook.cells if cell in code or cell.source.startswith(STUDY)]
+    notebook.cells = [*cells, *computing, *([fold(whole)] if code else [])]
 
 
 def tagged(cell: NotebookNode, *tags: str) -> bool:

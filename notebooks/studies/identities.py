@@ -321,7 +321,7 @@ def findings_one_image(values: Mapping[str, float | str]) -> Text:
 def identities_table(values: Mapping[str, float | str], resolution: float) -> Table:
     """Largest error of each identity, from `numbers`."""
     rows = [[title, _text(float(values[name]), resolution)] for name, title in IDENTITIES.items()]
-    return Table(["equation of the paper", "largest error"], rows)
+    return Table(["equation", "largest error"], rows)
 
 
 def _at_least(errors: ArrayLike, resolution: float) -> float:

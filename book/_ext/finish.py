@@ -65,7 +65,14 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     if body.find(id="phasor"):
         app.add_css_file("phasor.css")
         app.add_js_file("phasor.js", loading_method="defer")
+    if not body.select_one(".math"):
+        context["script_files"] = [script for script in context["script_files"] if not is_mathjax(script)]
     context["body"] = str(body)
+
+
+def is_mathjax(script: Any) -> bool:
+    """Return whether a script of a page is MathJax, or sets it up."""
+    return "mathjax" in str(script.filename).lower() or "MathJax" in script.attributes.get("body", "")
 
 
 def name_cells(body: Tag) -> None:
@@ -180,7 +187,6 @@ def copy_mathjax(folder: Path) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Finish each page, and their folder at the end."""
     app.add_config_value("moved_pages", {}, "html")
-    app.set_html_assets_policy("per_page")  # MathJax where there is mathematics; MyST-NB asks for it on every page
-    app.connect("html-page-context", finish_page)
+    app.connect("html-page-context", finish_page, priority=900)  # after MathJax, which MyST-NB adds to every page
     app.connect("build-finished", finish_folder)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

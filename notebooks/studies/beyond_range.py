@@ -427,7 +427,7 @@ def findings_dimples(curves: DiameterCurves, bounds: Mapping[str, NDArray], thre
         f"{curves.rms[0]:.2g} rad rms {shown[LIKELY]}, the paper's iteration {shown[PLAIN]}, and its accelerated "
         f"form {shown[ACCELERATED]}.** We tried {curves.diameters[0]:.3g} to {curves.diameters[-1]:.3g} λ/D. "
         f"At the first dark ring of the Airy pattern, {DARK_RING:.2f} λ/D, the bound for tilt, divided by that of "
-        f"an ideal sensor, is {factors[TILT]}. For the other modes it is {factors[REST]}."
+        f"an ideal sensor, is {factors[TILT]}."
     )
 
 

@@ -397,13 +397,11 @@ def findings_work(passes: Mapping[str, int], reconstructors: Mapping[str, Any]) 
 
 
 def findings_steep(curves: LinearityCurves, limits: Mapping[str, Limit], exponent: float) -> Text:
-    """Return the ranges with another spectrum, and where its screens wrap."""
+    """Return the ranges with another spectrum, for the linear method, the arcsine and the iteration."""
     linear, arcsine, shifted = (_reach(curves, limits[name]) for name in ("Linear", "Arcsine", "PhaseShifted"))
-    onset = _wrap_onset(curves)
-    wraps = f"from {onset:.3g} rad rms on" if np.isfinite(onset) else "at no input"
     return Text(
         f"With the exponent {exponent:.3g}, the linear method stays within the threshold {linear}, the arcsine "
-        f"{arcsine}, and the iteration {shifted}. At least half of these screens have wraps {wraps}."
+        f"{arcsine}, and the iteration {shifted}."
     )
 
 

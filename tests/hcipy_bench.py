@@ -164,12 +164,12 @@ class HcipyBench:
         """
         window = tuple(slice(first, first + len(phase)) for first in corner)
         lit = self.pixel_means(self.lit)[window] > 0.999
-        left = np.where(lit, np.exp(1j * (phase - self.pixel_means(truth + self.flat)[window])), np.nan)
-        return np.angle(left * np.conj(np.nanmean(left)))
+        residual = np.where(lit, np.exp(1j * (phase - self.pixel_means(truth + self.flat)[window])), np.nan)
+        return np.angle(residual * np.conj(np.nanmean(residual)))
 
     def images(self, phase, seed, masked=True):
         """Two images of a camera as registration takes them."""
-        return [Image(one, np.zeros(one.shape, bool)) for one in self.counts(phase, seed, masked)]
+        return [Image(counts, np.zeros(counts.shape, bool)) for counts in self.counts(phase, seed, masked)]
 
     @property
     def truth(self):

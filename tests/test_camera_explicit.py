@@ -27,9 +27,9 @@ def guided():
     exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
     camera = Camera(N, SHAPE, 16, exposures, np.zeros((1, N * F, N * F)), F, 1.5)
     phase_map = PhaseMap(N, F, MapPrior(0.5, 4.0), 16)
-    known = Light(light, np.ones_like(light), light > 0, light > 0)
+    lit = Light(light, np.ones_like(light), light > 0, light > 0)
     images = np.full((2, *SHAPE), 1e4), np.full((2, *SHAPE), 1e-2)
-    problem = Problem(camera, *images, known, phase_map, (), VALUES)
+    problem = Problem(camera, *images, lit, phase_map, (), VALUES)
     white = 0.5 * np.random.default_rng(0).normal(size=phase_map.size**2)
     data = Explicit.of(Point(problem, white))
     return Point(replace(problem, guide=Posterior(data, phase_map)), white)

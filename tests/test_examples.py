@@ -6,7 +6,7 @@ import nbformat
 import numpy as np
 import pytest
 
-from studies.decision import two_digits
+from studies.kit.tables import with_zeros
 from zwfs.bench import Bench, write_bench
 
 from .conftest import ROOT
@@ -54,7 +54,7 @@ def test_table_of_delays_and_winds_is_that_of_the_example(capsys):
         for speed, cell in zip((20, 10, 5), cells, strict=True):
             residuals = {gain: residual(delay, speed, gain) for gain in (0.2, 0.4, 0.6, 0.8)}
             best = min(residuals, key=residuals.get)
-            assert cell == f"{two_digits(residuals[best])}, gain {best}"
+            assert cell == f"{with_zeros(residuals[best])}, gain {best}"
 
 
 def test_example_of_a_verdict_needs_only_the_package(tmp_path, monkeypatch, capsys):

@@ -47,7 +47,7 @@ def colours(figure):
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.filterwarnings("ignore")  # of small parameters
 def test_figures_of_a_notebook_suit_dark_pages_and_phones_and_mean_methods_by_their_colours(name, monkeypatch):
-    """Each method gets a colour next to its own: what is still drawn in the usual one is no method."""
+    """Each method gets a colour that differs slightly from its own, so its usual colour must not appear."""
     usual = {look.color for look in LOOKS.values()} - {"#000000"}  # black is also the colour of ink
     for method, look in LOOKS.items():
         monkeypatch.setitem(LOOKS, method, replace(look, color=f"#{int(look.color[1:], 16) ^ 1:06X}"))

@@ -66,7 +66,7 @@ def without_data(axes):
     """Whether a panel has axes but nothing finite on them."""
     if not (axes.axison and axes.get_visible()) or hasattr(axes, "_colorbar"):
         return False
-    drawn = (*axes.images, *axes.containers, *(one for one in axes.collections if one.get_paths()))
+    drawn = (*axes.images, *axes.containers, *(drawing for drawing in axes.collections if drawing.get_paths()))
     curves = [line.get_xydata() for line in axes.lines if line.get_transform() == axes.transData]
     return not drawn and not any(np.isfinite(points).all(axis=1).any() for points in curves)
 

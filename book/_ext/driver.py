@@ -70,8 +70,8 @@ def begin(notebook: str, defaults: str, given: str) -> str:
     from studies.kit.parameters import check_parameters, typed
 
     plt.close("all")
-    for kept in (names, figures, variants):
-        kept.clear()
+    for state in (names, figures, variants):
+        state.clear()
     names["__name__"] = "__main__"
     exec(defaults, names)
     known = {name for name in names if name != "np" and not name.startswith("__")}

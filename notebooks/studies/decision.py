@@ -18,7 +18,7 @@ from studies.kit.bench import poked_frames, poked_linear
 from studies.kit.parameters import parameter_limits
 from studies.kit.results import rounded
 from studies.kit.style import OTHER_STYLES, TALL
-from studies.kit.tables import MISSING, Table, Text
+from studies.kit.tables import MISSING, Table, Text, with_zeros
 from zwfs import Arcsine, MaximumLikelihood, PhaseShifted, Pupil
 from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.turbulence import FrozenFlow
@@ -311,12 +311,7 @@ class Row:
     def error(self, n_images: int) -> str:
         """Error in words; none where at most half of the loops close."""
         few = self.n_loops > 0 and self.closed[n_images - 1] <= self.n_loops / 2
-        return MISSING if few else two_digits(self.errors[n_images - 1])
-
-
-def two_digits(error: float) -> str:
-    """Error with two significant digits, trailing zeros included."""
-    return f"{error:#.2g}".rstrip(".")
+        return MISSING if few else with_zeros(self.errors[n_images - 1])
 
 
 def simplest(errors: Mapping[str, NDArray], names: Iterable[str]) -> str:
@@ -367,7 +362,7 @@ def findings(open_loop: Sequence[Row], loops: Sequence[Row]) -> Text:
     text = f"In open loop, two images have the smaller error in {len(better)} of {len(open_loop)} cases"
     if better:
         most = max(better, key=lambda row: row.gain)
-        text += f", by a factor of up to {two_digits(most.gain)} ({_case(most)})"
+        text += f", by a factor of up to {with_zeros(most.gain)} ({_case(most)})"
     alike = [_case(row) for row in open_loop if 1 / _ALIKE <= row.gain <= _ALIKE]
     worse = [_case(row) for row in open_loop if row.gain < 1 / _ALIKE]
     text += "." + "".join(
@@ -402,7 +397,7 @@ def draw_comparison(open_loop: Sequence[Row], loops: Sequence[Row]) -> Figure:
     """Errors in open loop and loops that close, with two images and with one."""
     figure, (open_axes, loop_axes) = plt.subplots(1, 2, figsize=(7.5, 5), width_ratios=(1.25, 1))
     errors = [row.errors for row in open_loop]
-    _pairs(open_axes, open_loop, errors, two_digits)
+    _pairs(open_axes, open_loop, errors, with_zeros)
     room = np.min(errors) / 3, 3 * np.max(errors)  # for the numbers at the markers
     open_axes.set(xscale="log", xlim=room, title="open loop", xlabel="error (rad rms)")
     n_loops = loops[0].n_loops

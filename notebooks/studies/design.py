@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from studies.kit import sweeps
 from studies.kit.parameters import parameter_limits
 from studies.kit.style import LOOKS
-from studies.kit.tables import Table, Text
+from studies.kit.tables import Table, Text, with_zeros
 from zwfs.bounds import cramer_rao
 from zwfs.design import SensorDesign, method_errors
 
@@ -90,24 +90,25 @@ def findings(answer: SensorDesign, *, wanted_error: float, frame_rate: float, te
     if answer.method == "none":
         closest = min(answer.errors_nm, key=answer.errors_nm.__getitem__)
         return Text(
-            f"**No light is enough for {wanted_error:.3g} nm.** With {dimples}, none of the three methods reaches "
-            "this error, even with a thousand times the light that the bound asks for. The closest is "
-            f"{_METHODS[closest]}, with {_two(answer.errors_nm[closest])} nm. Reduce the input, or measure at a "
-            "longer wavelength."
+            f"**No light is enough for {wanted_error:.3g} nm.** With {dimples}, none of the three methods "
+            "reaches this error, even with a thousand times the light that the bound asks for. The closest is "
+            f"{_METHODS[closest]}, with {with_zeros(answer.errors_nm[closest])} nm. Reduce the input, or "
+            "measure at a longer wavelength."
         )
     return Text(
-        f"**{_two(answer.photons_per_exposure)} photons per exposure give an error of "
-        f"{_two(answer.errors_nm[answer.method])} nm.** Use {dimples}, and {_METHODS[answer.method]}. "
-        f"Each pupil point then has {_two(answer.photons_per_point)} photons in each of the two images. "
+        f"**{with_zeros(answer.photons_per_exposure)} photons per exposure give an error of "
+        f"{with_zeros(answer.errors_nm[answer.method])} nm.** Use {dimples}, and {_METHODS[answer.method]}. "
+        f"Each pupil point then has {with_zeros(answer.photons_per_point)} photons in each of the two images. "
         f"At {frame_rate:g} Hz, a telescope of {telescope:g} m collects this light from a star of magnitude "
-        f"{answer.magnitude:.1f}. No unbiased method has an error below {_two(answer.bound_nm)} nm at this light."
+        f"{answer.magnitude:.1f}. No unbiased method has an error below {with_zeros(answer.bound_nm)} nm at "
+        "this light."
     )
 
 
 def methods_table(answer: SensorDesign, wanted_error: float) -> Table:
     """Error of each method at the light of the answer, and whether it is within 10 % of the wanted one."""
     rows = [
-        [LOOKS[name].name, f"zwfs.{name}", _two(error), error <= 1.1 * wanted_error]
+        [LOOKS[name].name, f"zwfs.{name}", with_zeros(error), error <= 1.1 * wanted_error]
         for name, error in answer.errors_nm.items()
     ]
     return Table(["method", "class", "error (nm rms)", "is enough"], rows)
@@ -141,7 +142,7 @@ def numbers(answer: SensorDesign, **question: float) -> dict[str, float | str]:
     """Question and answer, for other pages."""
     return {
         **question,
-        "photons": _two(answer.photons_per_exposure),
+        "photons": with_zeros(answer.photons_per_exposure),
         "method": _METHODS[answer.method],
         "diameter": round(answer.diameter, 2),
         "shift": round(answer.phase_shift / np.pi, 2),
@@ -154,14 +155,3 @@ _METHODS = {
     "MaximumLikelihood": "maximum likelihood",
     "none": "none",
 }
-
-
-def _two(value: float) -> str:
-    """Two significant digits without a power of ten below a million."""
-    if not isfinite(value):
-        return "–"
-    rounded = float(f"{value:.2g}")
-    if rounded < 1e6:
-        return f"{rounded:.{max(0, 1 - int(np.floor(np.log10(rounded))))}f}" if rounded else "0"
-    digits, power = f"{rounded:.1e}".split("e")
-    return f"{digits}×10{str(int(power)).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))}"

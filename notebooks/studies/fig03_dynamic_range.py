@@ -182,8 +182,8 @@ def _label_ends(axes: Axes, ends: list[tuple[float, str, dict[str, Any]]]) -> No
         room = 1 - sum(heights[number:]) + half  # else those above would leave the axes
         middle = max(lowest + half, min((value - low) / (high - low), room))
         axes.plot(1.03, middle, ms=5, transform=axes.transAxes, clip_on=False, **style)
-        beside: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center"}
-        axes.annotate(text, (1.03, middle), (6, 0), fontsize=9, **beside)
+        options: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "va": "center"}
+        axes.annotate(text, (1.03, middle), (6, 0), fontsize=9, **options)
         lowest = middle + half
 
 

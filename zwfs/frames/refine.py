@@ -122,10 +122,10 @@ class _Search:
     def best(self, n_steps: int) -> Measurement:
         """Measurement with the values of the least misfit on the blocks of the search."""
         low, high, step = self.ranges
-        found = optimize.least_squares(
+        solution = optimize.least_squares(
             self._residuals, self.start, self._jacobian, bounds=(low, high), x_scale=step, max_nfev=n_steps
         )
-        return self._trial(found.x)
+        return self._trial(solution.x)
 
     def is_better(self, after: Measurement) -> bool:
         """Whether a measurement explains the blocks that the search has not seen better than that of the start."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import floor, isfinite, log10
 from typing import Any, NamedTuple
 
 MISSING = "–"
@@ -61,6 +61,17 @@ class Text:
 def two_digits(value: float) -> str:
     """Return a number with two significant digits, or a dash if it is not finite."""
     return f"{float(f'{value:.1e}'):g}" if isfinite(value) else MISSING
+
+
+def with_zeros(value: float) -> str:
+    """Return a number with two significant digits, zeros at the end included; a power of ten from a million on."""
+    if not isfinite(value):
+        return MISSING
+    rounded = float(f"{value:.2g}")
+    if rounded < 1e6:
+        return f"{rounded:.{max(0, 1 - floor(log10(rounded)))}f}" if rounded else "0"
+    digits, power = f"{rounded:.1e}".split("e")
+    return f"{digits}×10{str(int(power)).translate(str.maketrans('0123456789', '⁰¹²³⁴⁵⁶⁷⁸⁹'))}"
 
 
 def small(value: float) -> str:

@@ -80,6 +80,20 @@ class HcipyBench:
         inside = self.lit > 0.5
         return np.where(modes[1] != 0, screen - screen[inside].mean(), 0) * rms / screen[inside].std()
 
+    def segmented(self, rms, seed, tilts=True):
+        """Random pistons, and tips and tilts of the same rms, of the segments on the fine grid; 0 off them."""
+        numbers = _segments(self.aperture, self._size, self.pixels * self.fine)
+        rng, phase = np.random.default_rng(seed), np.zeros(numbers.shape)
+        places = np.indices(numbers.shape)
+        inside = self.lit > 0.5
+        for number in range(numbers.max() + 1):
+            own = (numbers == number) & inside
+            phase[own] = rng.normal()
+            if tilts:
+                slopes = places[:, own] - places[:, own].mean(axis=1, keepdims=True)
+                phase[own] += np.sum(rng.normal(size=(2, 1)) * slopes / slopes.std(axis=1, keepdims=True), axis=0)
+        return np.where(inside, phase - phase[inside].mean(), 0) * rms / phase[inside].std()
+
     @functools.cached_property
     def flat(self):
         """Phase without a command, fine grid, radian."""
@@ -231,6 +245,24 @@ BEFORE = {
 RMS = 0.3, 0.8, 1.2
 
 
+_HEXAGONS = 2, 0.19, 0.012, 1  # rings of segments, their width and gaps (D), and the first ring
+
+
+@functools.cache
+def _segments(name, size, across):
+    """Number of the segment that is nearest to each point of the fine grid, from 0 on."""
+    import hcipy
+
+    grid = hcipy.make_pupil_grid(size, size / across)
+    parts = {
+        "Keck": lambda: hcipy.make_keck_aperture(normalized=True, return_segments=True),
+        "hexagons": lambda: hcipy.make_hexagonal_segmented_aperture(*_HEXAGONS, return_segments=True),
+    }[name]()[1]
+    lit = np.array([np.asarray(part(grid)).reshape(size, size) > 0.5 for part in parts])
+    nearest = ndimage.distance_transform_edt(~lit.any(axis=0), return_distances=False, return_indices=True)
+    return lit.argmax(axis=0)[tuple(nearest)]
+
+
 @functools.cache
 def _aperture(name, size, across):
     import hcipy
@@ -242,6 +274,7 @@ def _aperture(name, size, across):
         "LUVOIR": lambda: hcipy.make_luvoir_a_aperture(normalized=True),
         "GMT": lambda: hcipy.make_gmt_aperture(normalized=True),
         "Keck": lambda: hcipy.make_keck_aperture(normalized=True),
+        "hexagons": lambda: hcipy.make_hexagonal_segmented_aperture(*_HEXAGONS),
     }[name]()
     return np.asarray(aperture(grid)).reshape(size, size)
 

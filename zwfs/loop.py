@@ -6,24 +6,19 @@ import math
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from itertools import product
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from zwfs import _check
 from zwfs._arrays import Immutable, read_only
+from zwfs._images import parts_of
 from zwfs.detector import Detector
 from zwfs.metrics import strehl, without_piston
 from zwfs.pupil import Pupil
 
 _LONGEST_DELAY = 1000  # cycles: beyond it only a gain below 0.0016 is stable
-_GAPS = 0.0, 0.5, 0.7, 0.8, 0.9, 0.95  # amplitude of gaps over that of their surroundings
-_BRIDGES = 0, 1, 2  # points by which parts shrink while they are counted
-_LEAST_PART = 0.2  # points of a part, over those of the largest
-_ALIKE = 0.35  # standard deviation of the sizes of parts, over their mean
 
 
 class Mirror(Immutable):
@@ -80,7 +75,7 @@ class Mirror(Immutable):
         """
         _check.instance("pupil", pupil, Pupil)
         tilts = _check.flag("tilts", tilts)
-        numbers = (_parts(pupil) if pupil.measured else pupil.segments)[pupil.inside]
+        numbers = (parts_of(pupil.amplitude) if pupil.measured else pupil.segments)[pupil.inside]
         own = (numbers == np.unique(numbers)[:, np.newaxis]).astype(float)
         rows = [own]
         for coordinate in pupil.points.T if tilts else ():
@@ -285,28 +280,3 @@ def _checked_screens(disturbance: Any, pupil: Pupil) -> Iterator[NDArray[np.floa
         yield screens
     if shape is None:
         raise ValueError("disturbance is empty: expected one wavefront for each cycle")
-
-
-def _parts(pupil: Pupil) -> NDArray[np.intp]:
-    """Number of the part of a measured pupil that each point belongs to, from 1 on; 0 outside.
-
-    A gap is where the amplitude is less than a share of that of its surroundings; an erosion cuts bridges across
-    it. Of several shares and erosions, those count that make the most parts of similar sizes. Points of gaps go to
-    the nearest part.
-    """
-    around, most = ndimage.median_filter(pupil.amplitude, 5), 1
-    best = pupil.inside.astype(int)
-    for share, cut in product(_GAPS, _BRIDGES):
-        bright = pupil.inside & (pupil.amplitude > share * around)
-        parts, n = ndimage.label(ndimage.binary_erosion(bright, iterations=cut) if cut else bright)
-        sizes = np.bincount(parts.ravel(), minlength=n + 1)
-        large = (sizes > _LEAST_PART * sizes[1:].max(initial=0)) & (np.arange(n + 1) > 0)
-        if np.count_nonzero(large) <= most:
-            continue
-        numbers = np.where(large, np.cumsum(large), 0)[parts]
-        nearest = ndimage.distance_transform_edt(numbers == 0, return_distances=False, return_indices=True)
-        grown = np.where(pupil.inside, numbers[tuple(nearest)], 0)
-        sizes = np.bincount(grown.ravel())[1:]
-        if sizes.min() > _LEAST_PART * sizes.max() and sizes.std() < _ALIKE * sizes.mean():
-            best, most = grown, len(sizes)
-    return best

@@ -2,7 +2,9 @@
 
 The unknowns are the coefficients of the phase's spline where there is light. A coefficient changes the images near
 its own place, and through the light of the dimple, which few numbers describe. Coefficients far apart do not share
-a pixel, so one derivative gives the local changes of a whole comb of them.
+a pixel, so one derivative gives the local changes of a whole comb of them. On a pupil with segments, the steps of
+these are unknowns, too: here the coefficients include the means of the steps over the pixels, so that a step alone
+is what a spline lacks at gaps.
 """
 
 from __future__ import annotations
@@ -36,7 +38,10 @@ class Explicit:
         self.pairs = (rows[:, None] - rows) % size * size + (columns[:, None] - columns) % size
         self._number = np.full(lit.shape, -1)
         self._number[lit] = np.arange(len(self.where[0]))
-        near, into, along = self._near(), *self._dimple()
+        segments = point.problem.phase_map.segments
+        self.steps = segments.maps[:, lit].T if segments else np.zeros((len(rows), 0))
+        edges = self._edges()
+        near, into, along = self._near(edges), *self._dimple(edges)
         half = (near.T @ into + along.T @ (into.T @ into) / 2) @ along
         matrix = (near.T @ near).toarray() + half + half.T
         self.diagonal = np.diagonal(matrix).copy()
@@ -53,14 +58,27 @@ class Explicit:
 
     def best(self, point: Point) -> NDArray[np.float64]:
         """Coefficients that explain the images best without a prior, to first order at a point nearby."""
-        problem, phase_map = point.problem, point.problem.phase_map
+        problem, phase_map, white = point.problem, point.problem.phase_map, point.problem.split(point.x)[0][0]
         slope = point.model.adjoint(problem.weights * point.residuals).phase
         gradient = (phase_map.along.T @ slope @ phase_map.along)[self.where]
-        coefficients = phase_map.coefficients(problem.split(point.x)[0][0])[self.where]
+        coefficients = phase_map.coefficients(white)[self.where]
+        if phase_map.segments:
+            steps = phase_map.steps(white) if phase_map.stepped else np.zeros(self.steps.shape[1])
+            gradient = np.append(gradient, phase_map.segments.adjoint(slope) - self.steps.T @ gradient)
+            coefficients = np.append(coefficients + self.steps @ steps, steps)
         return coefficients - linalg.blas.dsymv(1.0, self.inverse.T, gradient, lower=True)
 
-    def _near(self) -> sparse.csr_array:
-        """Change of the residuals with each coefficient, without the light of the dimple."""
+    def _edges(self) -> NDArray[np.float64]:
+        """What the spline of the means of each step lacks, (n_steps, n, n) on the fine grid."""
+        phase_map, n_steps = self._point.problem.phase_map, self.steps.shape[1]
+        if not n_steps:
+            return np.zeros((0, *self._point.phase.shape))
+        coefficients = np.zeros((n_steps, phase_map.size, phase_map.size))
+        coefficients[:, self.where[0], self.where[1]] = self.steps.T
+        return phase_map.segments.fine(np.eye(n_steps)) - phase_map.along @ coefficients @ phase_map.along.T
+
+    def _near(self, edges: NDArray) -> sparse.csr_array:
+        """Change of the residuals with each coefficient and step, without the light of the dimple."""
         point, along = self._point, self._point.problem.phase_map.along
         model, zero, starts = point.matrix.model, np.zeros_like(point.phase), np.arange(_APART)
         combs = np.array([along[:, start : len(self._number) : _APART].sum(axis=1) for start in starts])
@@ -71,7 +89,16 @@ class Explicit:
         row = np.broadcast_to(np.arange(column.shape[1]), column.shape)
         seen = (column >= 0) & (changes != 0)
         size = column.shape[1], len(self.where[0])
-        return sparse.csr_array((changes[seen], (row[seen], column[seen])), size)
+        near = sparse.csr_array((changes[seen], (row[seen], column[seen])), size)
+        if not len(edges):
+            return near
+        parts = [
+            (point.problem.weights * model.apply(zero, zero, few, dimple=False)).reshape(len(few), -1)
+            for few in np.array_split(edges, -(-len(edges) // _TOGETHER))
+        ]
+        changes = np.concatenate(parts).T
+        changes[np.abs(changes) < _FAINTEST * np.abs(changes).max()] = 0
+        return sparse.hstack([near, sparse.csr_array(changes)], format="csr")
 
     def _owners(self, arm: int) -> NDArray[np.intp]:
         """Number of the coefficient of each comb next to each pixel, (n_combs, n_pixels); -1 if it is dark."""
@@ -82,14 +109,16 @@ class Explicit:
         row, column = (np.clip(one, -1, n) + 1 for one in (row, column))
         return padded[row[:, None], column].reshape(_APART**2, -1)
 
-    def _dimple(self) -> tuple[NDArray, NDArray]:
-        """Change of the residuals with the light of the dimple, and of that light with the coefficients."""
+    def _dimple(self, edges: NDArray) -> tuple[NDArray, NDArray]:
+        """Change of the residuals with the light of the dimple, and of that light with coefficients and steps."""
         problem, model = self._point.problem, self._point.matrix.model
         _, strength, basis = linalg.svd(np.concatenate([core[0] for core in model.optics.cores.values()]))
         basis = basis[: np.count_nonzero(strength > _FAINTEST * strength[0])]
         fields = model.camera.planes[0].expand(basis) * model.phase_slope
         along = problem.phase_map.along
         moved = (along.T @ fields @ along)[:, self.where[0], self.where[1]]
+        if len(edges):
+            moved = np.hstack([moved, fields.reshape(len(fields), -1) @ edges.reshape(len(edges), -1).T])
         images = problem.weights * model.of_dimple(np.concatenate([basis.conj(), 1j * basis.conj()]))
         return images.reshape(len(images), -1).T, np.concatenate([moved.real, moved.imag])
 
@@ -101,8 +130,12 @@ class Posterior:
     """
 
     def __init__(self, data: Explicit, prior: PhaseMap) -> None:
-        self._data, self._prior = data, prior
+        self._data, self._prior, n_steps = data, prior, data.steps.shape[1]
         self._covariance = fft.irfft2(prior.spline**2, s=(prior.size,) * 2).take(data.pairs)
+        if n_steps:
+            self._covariance = np.pad(self._covariance, (0, n_steps))
+            self._steps = prior.prior.jumps * np.concatenate([data.steps, np.eye(n_steps)])
+            self._covariance += self._steps @ self._steps.T
         total = data.inverse + self._covariance
         self._factor = linalg.cho_factor(total.T, lower=True, overwrite_a=True, check_finite=False)
         self.log_determinant = data.log_determinant + 2 * float(np.sum(np.log(np.diagonal(self._factor[0]))))
@@ -113,14 +146,19 @@ class Posterior:
         probes = np.random.default_rng(0).choice([-1.0, 1.0], (len(self._covariance), _PROBES))
         return float(np.vdot(probes, self._solve(self._covariance @ probes))) / _PROBES
 
-    def evidence(self, best: NDArray) -> tuple[float, float]:
-        """Minus the logarithm of the evidence of the prior but for a constant, and the growth of its variance.
+    def evidence(self, best: NDArray) -> tuple[float, tuple[float, ...]]:
+        """Minus the logarithm of the evidence of the prior but for a constant, and the growths of its variances.
 
         `best` are the coefficients that explain the images best. With them, the least cost has a closed form.
         """
         v = self._solve(best)
-        squares = float(v @ self._covariance @ v)
-        return (float(best @ v) + self.log_determinant) / 2, growth_of(squares, self.determined)
+        squares, determined = float(v @ self._covariance @ v), self.determined
+        evidence = (float(best @ v) + self.log_determinant) / 2
+        if not self._prior.stepped:
+            return evidence, (growth_of(squares, determined),)
+        jumped = float(np.sum((self._steps.T @ v) ** 2))
+        fixed = float(np.sum(self._steps * self._solve(self._steps)))
+        return evidence, (growth_of(squares - jumped, determined - fixed), growth_of(jumped, fixed))
 
     def inverse(self, r: NDArray) -> NDArray[np.float64]:
         """Inverse of the matrix times vectors."""
@@ -134,13 +172,19 @@ class Posterior:
         return linalg.cho_solve(self._factor, right, check_finite=False)
 
     def _coefficients(self, white: NDArray) -> NDArray[np.float64]:
-        maps = white.reshape(*white.shape[:-1], self._prior.size, self._prior.size)
         rows, columns = self._data.where
-        return self._prior.coefficients(maps)[..., rows, columns]
+        coefficients = self._prior.coefficients(white)[..., rows, columns]
+        if not self._data.steps.shape[1]:
+            return coefficients
+        coefficients = np.pad(coefficients, [(0, 0)] * (white.ndim - 1) + [(0, self._data.steps.shape[1])])
+        if self._prior.stepped:
+            coefficients += white[..., self._prior.size**2 :] @ self._steps.T
+        return coefficients
 
     def _white(self, coefficients: NDArray) -> NDArray[np.float64]:
         """Adjoint of `_coefficients`."""
         maps = np.zeros((*coefficients.shape[:-1], self._prior.size, self._prior.size))
         rows, columns = self._data.where
-        maps[..., rows, columns] = coefficients
-        return self._prior.coefficients(maps).reshape(*coefficients.shape[:-1], -1)
+        maps[..., rows, columns] = coefficients[..., : len(rows)]
+        white = self._prior.filtered(maps)
+        return np.concatenate([white, coefficients @ self._steps], axis=-1) if self._prior.stepped else white

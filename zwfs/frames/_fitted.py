@@ -16,6 +16,7 @@ from zwfs._unwrapping import unwrapped
 from zwfs.frames._explicit import Explicit, Posterior
 from zwfs.frames._fit import EXPLAINED, BenchFit, places_of
 from zwfs.frames._optics import Camera, Exposure, Linearised, pooled
+from zwfs.frames._segments import Segments
 from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem, allowing, fine_phase, minimise
 from zwfs.frames._states import PAD
 from zwfs.frames.phases import Flag, Phases
@@ -37,6 +38,7 @@ _UPDATES = 4  # of the rms of a prior
 _STATIONARY = 0.1  # logarithm of the factor on the variance of a prior, below which no update follows
 _POWERS = 0.5, 2.0  # least and most power of this factor in an update of the rms
 _STRONGER = 4.5  # factor on the first rms for each unit of the exponent: the same density at about 10 cycles / D
+_LEAST_JUMP = 0.01  # radian, rms of jumps, below which a phase has none
 _ALLOWED = 0.05  # error of the model in the first stage, over the light of a full pixel
 _LEAST, _MOST = 1e-12, 1e12  # counts: least of a noise, and most of a frame
 _DRAWS = 12  # for the error bars of a phase
@@ -154,7 +156,8 @@ class FittedSensor:
     The phase-shifted iteration with the fitted mask and amplitude gives a start. Then the phase alone is fitted
     with all of the model. In the first stage an error of the model adds to the noise, which keeps edges of the
     pupil from holding a wrong start. The prior is smooth to a degree that the evidence chooses: the probability of
-    the frames with all phases of the prior.
+    the frames with all phases of the prior. On a pupil with segments, the evidence also chooses whether the phase
+    jumps between them.
     """
 
     def __init__(self, fit: BenchFit) -> None:
@@ -163,6 +166,7 @@ class FittedSensor:
         pair = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
         settings: Any = pair, np.zeros((1, side, side)), of.oversampling, of.largest
         self._camera = Camera(of.n, of.shape, of.n_pixels, *settings)
+        self._segments = Segments.of(of)
 
     def frames(self, phase: NDArray) -> NDArray[np.float64]:
         """Frames (2, ny, nx), counts, of a phase (n, n) that includes that of the optics."""
@@ -180,7 +184,8 @@ class FittedSensor:
         allowed = _ALLOWED * np.array([arm["flux"] for arm in self._model.arms])
         soft = allowing(weights, allowed[:, None, None])
         start = self._start(counts)
-        phase_map = self._phase_map(MapPrior(_rms_of(start), 3.0))
+        segments = self._segments if prior is None or prior.jumps else None
+        phase_map = self._phase_map(MapPrior(_rms_of(start), 3.0), segments)
         problem = Problem(self._camera, counts, soft, self._model.light, phase_map, (), self._model.values)
         point = minimise(problem, phase_map.white(start), 3, 12)[0]
         point = Point(replace(problem, weights=weights), point.x)
@@ -194,19 +199,31 @@ class FittedSensor:
     def _chosen(self, start: Point) -> Point:
         """Phase with the prior that the evidence chooses."""
         exponent, rms, data = _EXPONENTS[0], _rms_of(start.phase_means), Explicit.of(start)
-        prior = MapPrior(rms * _STRONGER ** (exponent - 4), exponent)
+        jumps = rms / 2 if start.problem.phase_map.segments else 0.0
+        prior = MapPrior(rms * _STRONGER ** (exponent - 4), exponent, jumps=jumps)
         point, converged = _lowered(self._under(prior, start, data), 4)
         if not converged:  # the matrix at the start may be far from that of this phase
             data = Explicit.of(point)
         best = None if data is None else data.best(point)
-        least = math.inf
+        point, least = self._smoothest(point, data, best, math.inf)
+        prior = point.problem.phase_map.prior
+        if not prior.jumps:
+            return point
+        whole, without = self._smoothest(self._under(prior._replace(jumps=0.0), point, data), data, best, least)
+        return whole if without < least else point
+
+    def _smoothest(self, point: Point, data: Explicit | None, best: Any, least: float) -> tuple[Point, float]:
+        """Point with the exponent of the prior at which the evidence is largest, and minus its logarithm.
+
+        The point stays if minus the logarithm exceeds `least` for the smoothest prior.
+        """
         for exponent in _EXPONENTS:
             prior = _denser(point.problem.phase_map.prior, exponent)
             tried, evidence = self._strongest(prior, point, data, best, least)
             if evidence > least:
                 break
             least, point = evidence, tried
-        return point
+        return point, least
 
     def _strongest(
         self, prior: MapPrior, point: Point, data: Explicit | None, best: Any, least: float
@@ -216,32 +233,32 @@ class FittedSensor:
         With an explicit matrix, the phase stays that of the point. A prior that is clearly worse than one with
         minus the logarithm `least` is not pursued.
         """
-        tried: list[tuple[float, float]] = []
+        tried: list[list[tuple[float, float]]] = []
         for _ in range(_UPDATES):
             point = self._under(prior, point, data)
             guide = point.problem.guide
             point = point if guide else _lowered(point, 2)[0]
-            evidence, growth = guide.evidence(best) if guide else point.matrix.evidence
-            if abs(growth) < (_STATIONARY if evidence < least else 3 * _STATIONARY):
+            evidence, growths = guide.evidence(best) if guide else point.matrix.evidence
+            if max(map(abs, growths)) < (_STATIONARY if evidence < least else 3 * _STATIONARY):
                 break
-            strength = math.log(prior.rms)
-            power = 0.5 if growth > 0 else 1.0
-            if tried:  # Newton's step with the slope between the last two
-                before, then = tried[-1]
-                power = float(np.clip((strength - before) / (then - growth), *_POWERS)) if then != growth else 0.5
-            tried.append((strength, growth))
-            prior = prior._replace(rms=prior.rms * math.exp(power * growth))
+            strengths = [math.log(strength) for strength in prior.strengths]
+            before = tried[-1] if tried and len(tried[-1]) == len(growths) else [None] * len(growths)
+            tried.append(list(zip(strengths, growths, strict=True)))
+            prior = prior.scaled([math.exp(_step(*pair)) for pair in zip(tried[-1], before, strict=True)])
+            if prior.jumps < _LEAST_JUMP:
+                prior = prior._replace(jumps=0.0)
         return point, evidence
 
-    def _phase_map(self, prior: MapPrior) -> PhaseMap:
-        return PhaseMap(self._camera.n, self._camera.f, prior, self._camera.n_pixels)
+    def _phase_map(self, prior: MapPrior, segments: Segments | None) -> PhaseMap:
+        return PhaseMap(self._camera.n, self._camera.f, prior, self._camera.n_pixels, segments)
 
     def _under(self, prior: MapPrior, point: Point, data: Explicit | None) -> Point:
         """The same phase with another prior."""
-        phase_map = self._phase_map(prior)
+        before = point.problem.phase_map
+        phase_map = self._phase_map(prior, before.segments)
         guide = None if data is None else Posterior(data, phase_map)
         problem = replace(point.problem, phase_map=phase_map, guide=guide)
-        return Point(problem, phase_map.white(point.phase_means))
+        return Point(problem, phase_map.white(point.phase_means, before.steps(point.x) if before.stepped else None))
 
     def _start(self, counts: NDArray) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""
@@ -259,13 +276,38 @@ class FittedSensor:
         sensor = ZernikeSensor(pupil, *dimples, tolerance=1e-5)
         found = PhaseShifted(sensor, n_iterations=25, tolerance=1e-3)(np.maximum(images, 0)).phase
         inside = ndimage.binary_erosion(pupil.inside) | (pupil.inside & (light > 0.8))
-        phase = nearest_good(unwrapped(np.nan_to_num(found), inside), inside)
+        phase = nearest_good(self._unwrapped(np.nan_to_num(found), inside), inside)
         return phase - phase[inside].mean()
+
+
+    def _unwrapped(self, phase: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
+        """Phase without jumps of 2 pi in a segment; those between segments may be steps."""
+        whole = unwrapped(phase, inside)
+        if self._segments is None:
+            return whole
+        out, numbers = whole.copy(), self._segments.numbers
+        for number in range(1, numbers.max() + 1):
+            own = inside & (numbers == number)
+            if own.any():
+                part = unwrapped(phase, own)[own]
+                out[own] = part + 2 * np.pi * np.rint(np.median(whole[own] - part) / (2 * np.pi))
+        return out
+
+
+def _step(now: tuple[float, float], before: tuple[float, float] | None) -> float:
+    """Change of the logarithm of a strength, from those and the growths now and before."""
+    strength, growth = now
+    power = 0.5 if growth > 0 else 1.0
+    if before:  # Newton's step with the slope between the last two
+        power = 0.5
+        if before[1] != growth:
+            power = float(np.clip((strength - before[0]) / (before[1] - growth), *_POWERS))
+    return power * growth
 
 
 def _denser(prior: MapPrior, exponent: float) -> MapPrior:
     """Prior with another exponent, and the same density where images still show it."""
-    return MapPrior(prior.rms * _STRONGER ** (exponent - prior.exponent), exponent)
+    return prior._replace(rms=prior.rms * _STRONGER ** (exponent - prior.exponent), exponent=exponent)
 
 
 def _lowered(point: Point, n_steps: int) -> tuple[Point, bool]:

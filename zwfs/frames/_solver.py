@@ -11,11 +11,12 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, linalg, ndimage
+from scipy import fft, linalg, ndimage, sparse
 from scipy.interpolate import BSpline
 
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Linearised, names_of, pooled, symbol
+from zwfs.frames._segments import Segments
 
 if TYPE_CHECKING:
     from zwfs.frames._explicit import Posterior
@@ -56,11 +57,24 @@ class Free(NamedTuple):
 
 
 class MapPrior(NamedTuple):
-    """Gaussian prior of a map: its power spectral density is a power law, flat below 1 cycle / outer scale."""
+    """Gaussian prior of a map: its power spectral density is a power law, flat below 1 cycle / outer scale.
+
+    A phase may also jump between the segments of a pupil, by a piston, a tip and a tilt of each.
+    """
 
     rms: float  # of a pixel
     exponent: float = 0.0  # 0 for pixels that are independent
     outer_scale: float = 2.0  # D
+    jumps: float = 0.0  # rms of each piston, and over its segment of each tip and tilt
+
+    @property
+    def strengths(self) -> tuple[float, ...]:
+        """Standard deviations that scale the prior."""
+        return (self.rms, self.jumps) if self.jumps else (self.rms,)
+
+    def scaled(self, factors: Sequence[float]) -> MapPrior:
+        """Prior whose standard deviations are multiplied."""
+        return self._replace(**dict(zip(("rms", "jumps"), np.multiply(self.strengths, factors).tolist())))
 
     def spectrum(self, size: int, n_pixels: float) -> NDArray[np.float64]:
         """Variance of each frequency on a periodic grid, on half the plane, (size, size // 2 + 1)."""
@@ -72,34 +86,71 @@ class MapPrior(NamedTuple):
 
 
 class PhaseMap:
-    """White numbers to the means of a phase over the pixels, and to a cubic spline of it on the fine grid."""
+    """White numbers to the means of a phase over the pixels, and to the phase on the fine grid.
 
-    def __init__(self, n: int, oversampling: int, prior: MapPrior, n_pixels: float) -> None:
+    The phase is a cubic spline, from size * size white numbers, and the steps of the segments, from the others.
+    """
+
+    def __init__(
+        self, n: int, oversampling: int, prior: MapPrior, n_pixels: float, segments: Segments | None = None
+    ) -> None:
         self.n, self.prior, self.size = n, prior, fft.next_fast_len(round(1.2 * n), real=True)
         self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
         self.along = fine_spline(n, oversampling, self.size)
         self.spline = self.colour / symbol(_PIXEL_MEAN, self.size)
+        self.segments = segments
+        self.stepped = segments if prior.jumps else None
+        self.n_white = self.size**2 + (self.stepped.n_steps if self.stepped else 0)
 
     def means(self, white: NDArray) -> NDArray[np.float64]:
         """Mean over each pixel, (..., n, n)."""
-        return fft.irfft2(self.colour * fft.rfft2(white), s=white.shape[-2:])[..., : self.n, : self.n]
+        maps = self._maps(white)
+        means = fft.irfft2(self.colour * fft.rfft2(maps), s=maps.shape[-2:])[..., : self.n, : self.n]
+        return means + self.stepped.means(self.steps(white)) if self.stepped else means
 
-    def white(self, means: NDArray) -> NDArray[np.float64]:
-        """White numbers, (size * size,), of a phase with these means."""
+    def white(self, means: NDArray, steps: NDArray | None = None) -> NDArray[np.float64]:
+        """White numbers of a phase with these means, and with these steps if it has some.
+
+        What lies beyond the segments is replaced where steps begin, or end.
+        """
+        begin = self.stepped is not None and steps is None
+        if begin:
+            steps = self.stepped.fitted(means)
+        if self.stepped:
+            means = means - self.stepped.means(steps)
+        if begin or (steps is not None and not self.stepped):
+            means = self.segments.continued(means)
         wide = np.pad(means, ((0, self.size - self.n),) * 2, "linear_ramp")
-        return fft.irfft2(fft.rfft2(wide) / self.colour, s=wide.shape).ravel()
+        white = fft.irfft2(fft.rfft2(wide) / self.colour, s=wide.shape).ravel()
+        return np.concatenate([white, steps / self.prior.jumps]) if self.stepped else white
 
     def fine(self, white: NDArray) -> NDArray[np.float64]:
         """Phase on the fine grid."""
-        return self.along @ self.coefficients(white) @ self.along.T
+        smooth = self.along @ self.coefficients(white) @ self.along.T
+        return smooth + self.stepped.fine(self.steps(white)) if self.stepped else smooth
 
     def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
         """Adjoint of `fine`."""
-        return self.coefficients(self.along.T @ fine @ self.along)
+        white = self.filtered(self.along.T @ fine @ self.along)
+        if not self.stepped:
+            return white
+        return np.concatenate([white, self.prior.jumps * self.stepped.adjoint(fine)], axis=-1)
+
+    def steps(self, white: NDArray) -> NDArray[np.float64]:
+        """Steps of the segments, radian, (..., n_steps)."""
+        return self.prior.jumps * white[..., self.size**2 :]
 
     def coefficients(self, white: NDArray) -> NDArray[np.float64]:
-        """Coefficients of the spline, (..., size, size); the operator is its own adjoint."""
-        return fft.irfft2(self.spline * fft.rfft2(white), s=white.shape[-2:])
+        """Coefficients of the spline, (..., size, size)."""
+        maps = self._maps(white)
+        return fft.irfft2(self.spline * fft.rfft2(maps), s=maps.shape[-2:])
+
+    def filtered(self, maps: NDArray) -> NDArray[np.float64]:
+        """Adjoint of `coefficients`, (..., size * size)."""
+        return fft.irfft2(self.spline * fft.rfft2(maps), s=maps.shape[-2:]).reshape(*maps.shape[:-2], -1)
+
+    def _maps(self, white: NDArray) -> NDArray:
+        return white[..., : self.size**2].reshape(*white.shape[:-1], self.size, self.size)
 
 
 class LightMap:
@@ -108,17 +159,19 @@ class LightMap:
     def __init__(self, where: NDArray, prior: MapPrior, n_pixels: float) -> None:
         self.where, self.n, self.prior = where, len(where), prior
         self.size = fft.next_fast_len(round(1.05 * self.n), real=True)
+        self.n_white = self.size**2
         self.colour = np.sqrt(prior.spectrum(self.size, n_pixels))
 
     def fine(self, white: NDArray) -> NDArray[np.float64]:
-        change = fft.irfft2(self.colour * fft.rfft2(white), s=white.shape[-2:])
+        maps = white.reshape(*white.shape[:-1], self.size, self.size)
+        change = fft.irfft2(self.colour * fft.rfft2(maps), s=maps.shape[-2:])
         return change[..., : self.n, : self.n] * self.where
 
     def adjoint(self, fine: NDArray) -> NDArray[np.float64]:
         """Adjoint of `fine`."""
         whole = np.zeros((*fine.shape[:-2], self.size, self.size), fine.dtype)
         whole[..., : self.n, : self.n] = fine * self.where
-        return fft.irfft2(self.colour * fft.rfft2(whole), s=whole.shape[-2:])
+        return fft.irfft2(self.colour * fft.rfft2(whole), s=whole.shape[-2:]).reshape(*fine.shape[:-2], -1)
 
 
 def _single(values: Any) -> Any:
@@ -207,30 +260,26 @@ class Problem:
 
     @cached_property
     def n_white(self) -> int:
-        return sum(unknown.size**2 for unknown in self.maps)
+        return sum(unknown.n_white for unknown in self.maps)
 
     @property
     def start(self) -> NDArray[np.float64]:
         return np.concatenate([np.zeros(self.n_white), self.prior[0]])
 
     def split(self, x: NDArray) -> tuple[list[NDArray], NDArray]:
-        """White maps and free numbers."""
-        ends = np.cumsum([unknown.size**2 for unknown in self.maps])
-        *white, free = np.split(x, ends, axis=-1)
-        shapes = [(*x.shape[:-1], unknown.size, unknown.size) for unknown in self.maps]
-        return [values.reshape(shape) for values, shape in zip(white, shapes, strict=True)], free
+        """White numbers of each map, and free numbers."""
+        *white, free = np.split(x, np.cumsum([unknown.n_white for unknown in self.maps]), axis=-1)
+        return white, free
 
     def joined(self, phase: NDArray, light: NDArray) -> NDArray[np.float64]:
         """Adjoint of the maps, with zeros for the free numbers."""
-        parts = [self.phase_map.adjoint(phase), *(light_map.adjoint(light) for light_map in self.light_maps)]
-        lead = phase.shape[:-2]
-        white = [part.reshape(*lead, -1) for part in parts]
-        return np.concatenate([*white, np.zeros((*lead, len(self.free)))], axis=-1)
+        white = [self.phase_map.adjoint(phase), *(light_map.adjoint(light) for light_map in self.light_maps)]
+        return np.concatenate([*white, np.zeros((*phase.shape[:-2], len(self.free)))], axis=-1)
 
     def light_change(self, white: Sequence[NDArray]) -> NDArray[np.float64]:
         """Change of the light on the fine grid."""
         pairs = zip(white[1:], self.light_maps, strict=True)
-        zero = np.zeros((*white[0].shape[:-2], *self.light.start.shape), white[0].dtype)
+        zero = np.zeros((*white[0].shape[:-1], *self.light.start.shape), white[0].dtype)
         return sum((light_map.fine(change) for change, light_map in pairs), zero)
 
 
@@ -414,7 +463,7 @@ class Matrix:
         return self.model.unspread(self.problem.weights, *self._slopes) + 1e-300
 
     @cached_property
-    def evidence(self) -> tuple[float, float]:
+    def evidence(self) -> tuple[float, tuple[float, ...]]:
         """Minus the logarithm of the evidence of the phase's prior, and the growth of its variance.
 
         Laplace's approximation, with approximate eigenvalues e of the matrix: cost + sum(log e) / 2. The growth
@@ -428,7 +477,7 @@ class Matrix:
         twice[0] = 1
         twice[-1] = 1 + size % 2
         determined = float(np.sum((1 - 1 / spectrum) * twice))
-        return self.cost + float(np.sum(np.log(spectrum) * twice)) / 2, growth_of(squares, determined)
+        return self.cost + float(np.sum(np.log(spectrum) * twice)) / 2, (growth_of(squares, determined),)
 
     def _response(self, probe: NDArray, answer: NDArray, of: PhaseMap | LightMap) -> NDArray[np.float64]:
         """Mean response of the images at each spatial frequency of a map."""
@@ -451,7 +500,8 @@ class Matrix:
         white, _ = self.problem.split(np.asarray(d, self.problem.camera.real))
         out = []
         for values, (factor, spectrum) in zip(white, self.filters, strict=True):
-            filtered = fft.irfft2(fft.rfft2(values * factor**power) * spectrum**power, s=factor.shape)
+            maps = values.reshape(*d.shape[:-1], *factor.shape)
+            filtered = fft.irfft2(fft.rfft2(maps * factor**power) * spectrum**power, s=factor.shape)
             out.append((filtered * factor**power).reshape(*d.shape[:-1], -1))
         return out
 

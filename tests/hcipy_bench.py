@@ -231,6 +231,7 @@ CASES = {
     "VLT": HcipyBench("VLT", **ERRORS),
     "turned": HcipyBench(**TURNED),
     "turned VLT": HcipyBench("VLT", **TURNED),
+    "hexagons": HcipyBench("hexagons", pixels=40, side=48, **ERRORS),
 }
 
 

@@ -208,6 +208,7 @@ TURNED = replace(CASES["turned VLT"], pixels=40, side=52)
 
 
 IDEAL = replace(CASES["ideal"], pixels=40, side=56)
+HEXAGONS = CASES["hexagons"]
 SMALL = replace(CASES["disc"], pixels=24, side=32)
 
 
@@ -293,6 +294,28 @@ def test_smooth_phase_of_a_whole_camera_image_is_that_of_its_windows():
     lost = whole(0 * image + np.nan, smooth=prior)
     assert lost.flags & Flag.LOST
     assert np.isnan(lost.phase).all()
+
+
+@pytest.mark.parametrize("tilts", [False, True], ids=["pistons", "tips and tilts"])
+def test_phase_jumps_at_the_gaps_of_a_segmented_pupil(tilts):
+    """With a smooth prior alone, it would be worse than without a prior."""
+    bench, calibration = HEXAGONS, fitted(HEXAGONS)
+    steps = bench.segmented(0.8, seed=1, tilts=tilts)
+    counts = bench.counts(steps, (7, 1))
+    estimate = calibration(counts, smooth=True)
+    [prior] = estimate.priors
+    assert prior.jumps > 0.2
+    assert bench.error(estimate, steps) < 0.7 * bench.error(calibration(counts), steps)
+    alone = calibration(counts, smooth=prior._replace(rms=0.9, jumps=0.0))
+    assert bench.error(estimate, steps) < 0.6 * bench.error(alone, steps)
+
+
+def test_smooth_phase_does_not_jump_at_gaps():
+    bench = HEXAGONS
+    screen = bench.smooth(0.8, seed=1)
+    estimate = fitted(bench)(bench.counts(screen, (7, 1)), smooth=True)
+    assert estimate.priors[0].jumps == 0
+    assert bench.error(estimate, screen) < 0.02
 
 
 def segments(bench, rms, width=6):

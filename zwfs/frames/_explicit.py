@@ -53,8 +53,13 @@ class Explicit:
     @classmethod
     def of(cls, point: Point) -> Explicit | None:
         """Matrix at a point, or None for a pupil of too many pixels."""
-        lit = ndimage.binary_dilation(pooled(point.light, point.problem.camera.f) > 0.01)
+        lit = _lit(point.light, point.problem.camera.f)
         return cls(point, lit) if np.count_nonzero(lit) <= _MOST else None
+
+    @staticmethod
+    def suits(light: NDArray, f: int) -> bool:
+        """Whether the pupil of a map of light has few enough pixels."""
+        return bool(np.count_nonzero(_lit(light, f)) <= _MOST)
 
     def best(self, point: Point) -> NDArray[np.float64]:
         """Coefficients that explain the images best without a prior, to first order at a point nearby."""
@@ -121,6 +126,11 @@ class Explicit:
             moved = np.hstack([moved, fields.reshape(len(fields), -1) @ edges.reshape(len(edges), -1).T])
         images = problem.weights * model.of_dimple(np.concatenate([basis.conj(), 1j * basis.conj()]))
         return images.reshape(len(images), -1).T, np.concatenate([moved.real, moved.imag])
+
+
+def _lit(light: NDArray, f: int) -> NDArray[np.bool_]:
+    """Pixels whose coefficients are unknown, from the light on the fine grid."""
+    return np.asarray(ndimage.binary_dilation(pooled(light, f) > 0.01))
 
 
 class Posterior:

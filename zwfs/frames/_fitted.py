@@ -156,8 +156,8 @@ class FittedSensor:
     The phase-shifted iteration with the fitted mask and amplitude gives a start. Then the phase alone is fitted
     with all of the model. In the first stage an error of the model adds to the noise, which keeps edges of the
     pupil from holding a wrong start. The prior is smooth to a degree that the evidence chooses: the probability of
-    the frames with all phases of the prior. On a pupil with segments, the evidence also chooses whether the phase
-    jumps between them.
+    the frames with all phases of the prior. On a pupil with segments and not too many pixels, the evidence
+    also chooses whether the phase jumps between them.
     """
 
     def __init__(self, fit: BenchFit) -> None:
@@ -166,7 +166,8 @@ class FittedSensor:
         pair = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
         settings: Any = pair, np.zeros((1, side, side)), of.oversampling, of.largest
         self._camera = Camera(of.n, of.shape, of.n_pixels, *settings)
-        self._segments = Segments.of(of)
+        few = Explicit.suits(of.light.changed(0), of.oversampling)
+        self._segments = Segments.of(of) if few else None  # conjugate gradients without the matrix are too slow
 
     def frames(self, phase: NDArray) -> NDArray[np.float64]:
         """Frames (2, ny, nx), counts, of a phase (n, n) that includes that of the optics."""
@@ -258,7 +259,7 @@ class FittedSensor:
         phase_map = self._phase_map(prior, before.segments)
         guide = None if data is None else Posterior(data, phase_map)
         problem = replace(point.problem, phase_map=phase_map, guide=guide)
-        return Point(problem, phase_map.white(point.phase_means, before.steps(point.x) if before.stepped else None))
+        return Point(problem, phase_map.white(point.phase_means, before.steps(point.x)))
 
     def _start(self, counts: NDArray) -> NDArray[np.float64]:
         """Phase of the phase-shifted iteration on images brought back to the pupil, unwrapped and continued."""

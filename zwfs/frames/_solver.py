@@ -37,6 +37,7 @@ _SETTLED = 0.3  # predicted decrease of half the sum of squares at which a fit h
 _QUIET = 0.7  # the same of the numbers alone, where it is known
 MISSED = 0.7
 """Errors of fits to frames of HCIPy, over the changes with a finer grid (rms)."""
+_NO_STEPS = np.zeros(0)
 _PIXEL_MEAN = 230 / 384, 2 * 76 / 384, 2 / 384  # of a cubic spline over a pixel, as a series of cosines
 
 
@@ -108,17 +109,16 @@ class PhaseMap:
         means = fft.irfft2(self.colour * fft.rfft2(maps), s=maps.shape[-2:])[..., : self.n, : self.n]
         return means + self.stepped.means(self.steps(white)) if self.stepped else means
 
-    def white(self, means: NDArray, steps: NDArray | None = None) -> NDArray[np.float64]:
+    def white(self, means: NDArray, steps: NDArray = _NO_STEPS) -> NDArray[np.float64]:
         """White numbers of a phase with these means, and with these steps if it has some.
 
         What lies beyond the segments is replaced where steps begin, or end.
         """
-        begin = self.stepped is not None and steps is None
-        if begin:
-            steps = self.stepped.fitted(means)
+        changes = bool(steps.size) != bool(self.stepped)
         if self.stepped:
+            steps = steps if steps.size else self.stepped.fitted(means)
             means = means - self.stepped.means(steps)
-        if begin or (steps is not None and not self.stepped):
+        if changes and self.segments:
             means = self.segments.continued(means)
         wide = np.pad(means, ((0, self.size - self.n),) * 2, "linear_ramp")
         white = fft.irfft2(fft.rfft2(wide) / self.colour, s=wide.shape).ravel()
@@ -137,7 +137,7 @@ class PhaseMap:
         return np.concatenate([white, self.prior.jumps * self.stepped.adjoint(fine)], axis=-1)
 
     def steps(self, white: NDArray) -> NDArray[np.float64]:
-        """Steps of the segments, radian, (..., n_steps)."""
+        """Steps of the segments, radian, (..., n_steps); none if the phase does not jump."""
         return self.prior.jumps * white[..., self.size**2 :]
 
     def coefficients(self, white: NDArray) -> NDArray[np.float64]:

@@ -461,8 +461,10 @@ class Calibration(Immutable):
             Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``.
         smooth : bool or MapPrior
             Whether phases are taken to be smooth, for a calibration with a `bench`. True lets the evidence of each
-            exposure choose the prior: the probability of the frames with all its phases. An item of `priors` of
-            earlier phases saves half of the time, and fits phases of the same roughness and strength only.
+            exposure choose the prior: the probability of the frames with all its phases. On a pupil with gaps it
+            may jump between segments, by a piston, a tip and a tilt of each, if the pupil has less than about 3000
+            pixels. An item of `priors` of earlier phases saves half of the time, and fits phases of the same
+            roughness and strength only.
         noise : float or array_like, shape (ny, nx) or (n_images, ny, nx), counts rms, optional
             Of the pixels, with `smooth`. By default it follows from the counts, and from gain and noise of the
             `bench`; that of means of several frames is smaller.

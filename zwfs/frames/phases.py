@@ -78,7 +78,8 @@ class Phases(PhaseResult):
     misfit : ndarray, shape (...), or None
         With a smooth prior: mean square of the residuals over the noise.
     priors : tuple of MapPrior
-        With a smooth prior: rms (radian), exponent of the spectrum and outer scale (D) of each exposure.
+        With a smooth prior: rms (radian), exponent of the spectrum and outer scale (D) of each exposure, and the
+        rms of its `jumps` (radian): pistons, tips and tilts of segments.
     measurement : Measurement or None
         Of `recover_phase` and `phase_of`: that of the pair, which `judge` and `write_phase` need.
     """

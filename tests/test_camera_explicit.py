@@ -22,7 +22,9 @@ VALUES = np.array(
 )
 
 
-QUARTERS = np.pad(Pupil.circular(16).amplitude > 0, 4) * (1 + np.add.outer(np.arange(N) > 11, 2 * (np.arange(N) > 11)))
+QUARTERS = np.pad(Pupil.circular(16).amplitude > 0, 4) * (
+    1 + np.add.outer(np.arange(N) > 11, 2 * (np.arange(N) > 11))
+)
 
 
 @pytest.fixture(scope="module", params=[0.0, 0.5], ids=["smooth", "with jumps"])

@@ -76,7 +76,7 @@ class Explicit:
     def _edges(self) -> NDArray[np.float64]:
         """What the spline of the means of each step lacks, (n_steps, n, n) on the fine grid."""
         phase_map, n_steps = self._point.problem.phase_map, self.steps.shape[1]
-        if not n_steps:
+        if not phase_map.segments:
             return np.zeros((0, *self._point.phase.shape))
         coefficients = np.zeros((n_steps, phase_map.size, phase_map.size))
         coefficients[:, self.where[0], self.where[1]] = self.steps.T

@@ -166,7 +166,7 @@ class FittedSensor:
         pair = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
         settings: Any = pair, np.zeros((1, side, side)), of.oversampling, of.largest
         self._camera = Camera(of.n, of.shape, of.n_pixels, *settings)
-        few = Explicit.suits(of.light.changed(0), of.oversampling)
+        few = Explicit.suits(np.maximum(of.light.start, 0), of.oversampling)
         self._segments = Segments.of(of) if few else None  # conjugate gradients without the matrix are too slow
 
     def frames(self, phase: NDArray) -> NDArray[np.float64]:
@@ -279,7 +279,6 @@ class FittedSensor:
         inside = ndimage.binary_erosion(pupil.inside) | (pupil.inside & (light > 0.8))
         phase = nearest_good(self._unwrapped(np.nan_to_num(found), inside), inside)
         return phase - phase[inside].mean()
-
 
     def _unwrapped(self, phase: NDArray, inside: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Phase without jumps of 2 pi in a segment; those between segments may be steps."""

@@ -34,7 +34,8 @@ class Segments:
         columns = [np.ones(own.shape)]
         for place in np.indices(fine.shape, float).reshape(2, -1):
             place = place - (np.bincount(own[lit], place[lit]) / count)[own]
-            columns.append(place / np.sqrt(np.bincount(own[lit], place[lit] ** 2) / count)[own])
+            spread = np.sqrt(np.bincount(own[lit], place[lit] ** 2) / count)
+            columns.append(place / np.maximum(spread, 0.5)[own])  # one point wide, a segment has no slope
         rows, places = np.repeat(np.arange(own.size), 3), np.stack([3 * own + k for k in range(3)], axis=1)
         shape = own.size, 3 * len(count)
         self.matrix = sparse.csr_array((np.stack(columns, axis=1).ravel(), (rows, places.ravel())), shape)
@@ -69,7 +70,7 @@ class Segments:
 
     @cached_property
     def _inverse(self) -> NDArray[np.float64]:
-        return np.linalg.pinv(self.maps[:, self.lit], rcond=1e-6)
+        return np.asarray(np.linalg.pinv(self.maps[:, self.lit], rcond=1e-6), float)
 
     def fitted(self, phase: NDArray) -> NDArray[np.float64]:
         """Steps, radian, of the segments that are nearest to a phase (n, n)."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import fft, linalg, ndimage, sparse
+from scipy import fft, linalg, ndimage
 from scipy.interpolate import BSpline
 
 from zwfs.frames._light import Light
@@ -75,7 +75,9 @@ class MapPrior(NamedTuple):
 
     def scaled(self, factors: Sequence[float]) -> MapPrior:
         """Prior whose standard deviations are multiplied."""
-        return self._replace(**dict(zip(("rms", "jumps"), np.multiply(self.strengths, factors).tolist())))
+        return self._replace(
+            **dict(zip(("rms", "jumps"), np.multiply(self.strengths, factors).tolist(), strict=False))
+        )
 
     def spectrum(self, size: int, n_pixels: float) -> NDArray[np.float64]:
         """Variance of each frequency on a periodic grid, on half the plane, (size, size // 2 + 1)."""

@@ -9,7 +9,7 @@ from zwfs import Pupil
 from zwfs.frames._explicit import Explicit, Posterior
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure
-from zwfs.frames._segments import Segments
+from zwfs.frames._segments import Segments, nearest_parts
 from zwfs.frames._solver import MapPrior, PhaseMap, Point, Problem
 
 N, F, SHAPE = 24, 2, (30, 30)
@@ -32,7 +32,7 @@ def guided(request):
     light = np.pad(Pupil.circular(16 * F).amplitude, 4 * F)
     exposures = [Exposure(0, 0, 0), Exposure(1, 1, 0)]
     camera = Camera(N, SHAPE, 16, exposures, np.zeros((1, N * F, N * F)), F, 1.5)
-    segments = Segments(QUARTERS, F) if request.param else None
+    segments = Segments(QUARTERS, nearest_parts(QUARTERS, F)) if request.param else None
     phase_map = PhaseMap(N, F, MapPrior(0.5, 4.0, jumps=request.param), 16, segments)
     lit = Light(light, np.ones_like(light), light > 0, light > 0)
     images = np.full((2, *SHAPE), 1e4), np.full((2, *SHAPE), 1e-2)
@@ -86,7 +86,7 @@ def test_images_without_a_good_pixel_leave_the_prior(guided):
 
 
 def test_steps_of_segments_are_found_in_their_phase():
-    segments, rng = Segments(QUARTERS, F), np.random.default_rng(0)
+    segments, rng = Segments(QUARTERS, nearest_parts(QUARTERS, F)), np.random.default_rng(0)
     steps, fine = rng.normal(size=12), rng.normal(size=(3, N * F, N * F))
     np.testing.assert_allclose(segments.fitted(segments.means(steps)), steps, rtol=0, atol=1e-12)
     np.testing.assert_allclose(segments.adjoint(fine) @ steps, np.sum(fine * segments.fine(steps), axis=(1, 2)))

@@ -20,7 +20,7 @@ from zwfs.frames._fitted import Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
-from zwfs.frames.files import CameraFile, averaged, combined, read, read_all
+from zwfs.frames.files import CameraFile, averaged, combined, read, read_all, relative_exposure
 from zwfs.frames.pipeline import Measurement, Optics, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
 from zwfs.frames.registration import Image, check_centers, check_diameter, find_pupils, register_frames
@@ -47,7 +47,8 @@ class Source(NamedTuple):
         try:
             optics = sources[0].optics(self.diameter, self.phase_shifts)
             _check_fit("fitted", fitted, optics)
-            registered = register_frames(masked, unmasked, **self.settings, n_pupils=len(optics.phase_shifts))
+            settings = {"exposure": relative_exposure(sources[0], sources[len(frames)])} | self.settings
+            registered = register_frames(masked, unmasked, **settings, n_pupils=len(optics.phase_shifts))
             registered, optics = fit(registered, optics, fitted)
             if saturation is None:
                 saturation = sources[0].keyword("SATURATE") if "SATURATE" in header else np.inf

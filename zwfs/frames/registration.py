@@ -35,6 +35,8 @@ _EDGE, _AROUND = 3, 8  # pixels around the pupil: those that take part where the
 # A pixel beyond all neighbours but one, by so many times their spread and noise: on frame and clear frame, on one.
 _ODD_ON_BOTH, _ODD = 0.5, 3.0
 _FAINT = 0.01  # of the brightest light: a pixel that is off by less does no harm
+_BRIGHTER = 1.5  # light of hot pixels that stand together over that of a pupil
+_UNLIT, _MOST_OF_IT = 0.2, 0.6  # light of a dead pixel over that around it, and part of a line that is dead or hot
 # Why an image holds one pupil, or two.
 _WHY = {
     1: "because another image holds the other pupil, or phase_shifts has one value",
@@ -60,6 +62,8 @@ class Image:
         Whether the surroundings of the pupil were set to 0 by software, so that they do not show the background.
     dark : ndarray, shape (ny, nx), or float
         Counts without light, which were subtracted; NaN where they are not known.
+    window : (int, int), optional
+        First row and column of the image on the detector, where they are known; counted from any number.
 
     Raises
     ------
@@ -72,6 +76,7 @@ class Image:
     name: str = "image"
     cut: bool = False
     dark: NDArray[np.float64] | float = 0.0
+    window: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         counts = _check.real_map("counts", self.counts, 2)
@@ -259,10 +264,10 @@ def register_frames(
 ) -> RegisteredFrames:
     """Find the pupils on the images and register these to each other.
 
-    The second clear frame is registered to the first. Frames of the same format as the clear frames are taken to
-    stand at the same place: the camera has not moved. If they are of another format, the pupils are located on
-    them, too, and each is registered to its clear frame. That is less reliable, because the phase changes the look
-    of gaps and edges.
+    The second clear frame is registered to the first. Frames are taken to stand at the same place of the detector
+    as the clear frames: the camera has not moved. If they are of another format and the windows of both on the
+    detector are not known, the pupils are located on them, too, and each is registered to its clear frame. That is
+    less reliable, because the phase changes the look of gaps and edges.
 
     Hot and dead pixels that are not yet marked as bad are found and marked: they are brighter or darker than all
     their neighbours but one, by much on one image or by less on frame and clear frame alike.
@@ -301,7 +306,10 @@ def register_frames(
             raise ValueError(f"{name} holds {len(images)} images: expected 1{' or 2' * (n_pupils == 2)}")
     n_marked = _n_bad(*frames, *clear_frames)
     # The clear frames are judged alone, so that a pupil stands at the same place for all frames.
-    frames, clear_frames = _without_odd(frames, clear_frames), _without_odd(clear_frames)
+    frames, clear_frames = (
+        _without_odd(frames, clear_frames, clear=False),
+        _without_odd(clear_frames, frames, clear=True),
+    )
     n_odd = _n_bad(*frames, *clear_frames) - n_marked
     if n_pupils == 1:
         frames, clear_frames = frames * 2, clear_frames * 2
@@ -314,9 +322,12 @@ def register_frames(
     _check_alike(clear, pupils)
     masked, circles = (frames[0], frames[-1]), pupils
     formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in (masked, clear)]
-    moved = formats[0] != formats[1]
-    if moved:
-        masked, circles = _locate(frames, None, diameter or pupils[0].diameter)
+    windows = [[image.window or () for image in pair] for pair in (masked, clear)]
+    stated = all(map(len, sum(windows, [])))
+    moved = formats[0] != formats[1] and not stated
+    if moved or (stated and windows[0] != windows[1]):
+        centers = np.array([circle[:2] for circle in pupils]) + windows[1] - windows[0] if stated else None
+        masked, circles = _locate(frames, centers, diameter or pupils[0].diameter)
     for image in masked:
         if not np.ptp(image.counts) > 0:
             raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
@@ -394,7 +405,8 @@ def register(
     Maximises the correlation of the two at the points `inside` the reference, after a band-pass that keeps gaps,
     vanes and edges but takes away noise, the illumination, and the grid of a deformable mirror, whose contrast
     depends on the focus of the camera. With `turn`, a rotation or magnification that the images do not determine
-    stays out: its standard error exceeds 0.05 pixels at the edge of `inside` and a tenth of its value.
+    stays out: its standard error exceeds 0.05 pixels at the edge of `inside`, and a tenth of its value or that value
+    is beyond the range that is allowed.
     """
     center = center or ((len(reference) - 1) / 2, (len(reference[0]) - 1) / 2)
     # Details of three times the width, at every third point, draw the search from farther away.
@@ -413,8 +425,14 @@ def register(
     free = turn | ~turns
     best, _ = coarse.search(np.array(start), free)
     best, sigma = details.search(best, free)
-    while (unsure := turns & free & ~(sigma < np.maximum(_SURE, _SIGNIFICANT * np.abs(best)))).any():
-        worst = np.argmax(np.where(unsure, np.nan_to_num(sigma, nan=np.inf), -1))
+    most = details.reach * np.array([np.inf, np.inf, np.radians(_LARGEST_TURN), _LARGEST_STRETCH])
+
+    def unsure() -> NDArray[np.bool_]:
+        significant = np.where(np.abs(best) < most, _SIGNIFICANT * np.abs(best), 0)
+        return turns & free & ~(sigma < np.maximum(_SURE, significant))
+
+    while (unsure_values := unsure()).any():
+        worst = np.argmax(np.where(unsure_values, np.nan_to_num(sigma, nan=np.inf), -1))
         free[worst], best[worst] = False, 0
         best, sigma = details.search(best, free)
     scale = np.array([1, 1, np.degrees(1 / details.reach), 1 / details.reach])
@@ -457,15 +475,23 @@ def _n_bad(*images: Image) -> int:
     return sum(int(np.count_nonzero(image.bad)) for image in images)
 
 
-def _without_odd(images: Sequence[Image], others: Sequence[Image] = ()) -> tuple[Image, ...]:
-    """Images with hot and dead pixels marked as bad; `others` show the same pixels without or with the mask."""
-    shapes = [[image.counts.shape for image in pair] for pair in (images, others)]
+def _without_odd(images: Sequence[Image], others: Sequence[Image], *, clear: bool) -> tuple[Image, ...]:
+    """Images with hot and dead pixels and lines marked as bad; `others` show them without or with the mask.
+
+    A group of bright pixels may be a poke on a frame, but is hot on a clear frame. A line without light may be a vane
+    on a clear frame, but is dead on a frame, where the mask sends light into it.
+    """
+    alike = [image.counts.shape for image in images] == [image.counts.shape for image in others]
     marked = []
     for index, image in enumerate(images):
-        sizes = _outstanding(image)
-        odd = sizes.max(axis=0) > _ODD
-        if shapes[0] == shapes[1]:
+        sizes, (hot, dead) = _outstanding(image), _lines(image)
+        odd = (sizes.max(axis=0) > _ODD) | hot
+        if alike and clear:
+            odd |= _groups(image) | (dead & _lines(others[index])[1])
+        elif alike:
             odd |= (np.minimum(sizes, _outstanding(others[index])) > _ODD_ON_BOTH).any(axis=0)
+            odd |= _groups(others[index])
+        odd |= dead & (not clear)
         bad = image.bad | odd
         marked.append(replace(image, counts=nearest_good(image.counts, ~bad), bad=bad) if odd.any() else image)
     return tuple(marked)
@@ -478,6 +504,34 @@ def _outstanding(image: Image) -> NDArray[np.float64]:
     low, middle, high = (ndimage.rank_filter(counts, rank, footprint=ring) for rank in (1, 4, -2))
     unit = high - low + ndimage.uniform_filter(np.abs(counts - middle), 7) + _FAINT * np.ptp(middle)
     return np.array([counts - high, low - counts]) / np.maximum(unit, 1e-300)
+
+
+def _groups(image: Image) -> NDArray[np.bool_]:
+    """Pixels of groups of a few that are brighter than those around them, and than the light of a pupil."""
+    counts, level, ring = image.counts, _half_lit(image.counts), np.pad(np.zeros((3, 3)), 1, constant_values=1)
+    dark = np.median(counts)
+    brighter = counts - dark > _BRIGHTER * (np.median(counts[counts > dark + level]) - dark)
+    return brighter & (counts - ndimage.rank_filter(counts, -4, footprint=ring) > level)
+
+
+def _lines(image: Image) -> NDArray[np.bool_]:
+    """Pixels of rows and columns that are brighter than those around them, and of those without light, (2, ny, nx)."""
+    counts, level = image.counts - np.median(image.counts), _half_lit(image.counts)
+    odd = np.zeros((2, *counts.shape), bool)
+    for axis in (0, 1):
+        lines = np.moveaxis(counts, axis, 0)
+        sides = [np.roll(lines, step, axis=0) for step in (-3, -2, 2, 3)]
+        lowest, highest = np.min(sides, axis=0), np.max(sides, axis=0)
+        lit = lowest > level
+        hot = np.mean(lines - highest > level, axis=1)
+        dead = np.sum(lit & (lines < _UNLIT * lowest), axis=1) / np.maximum(np.sum(lit, axis=1), _SMALLEST)
+        np.moveaxis(odd, axis + 1, 1)[:] |= (np.stack([hot, dead]) > _MOST_OF_IT)[..., np.newaxis]
+    return odd
+
+
+def _half_lit(counts: NDArray) -> float:
+    """About half of the light of a pupil, over its surroundings."""
+    return threshold(counts) - float(np.median(counts))
 
 
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:

@@ -55,7 +55,10 @@ class Source(NamedTuple):
             camera = {"saturation": saturation, "bunit": str(header.get("BUNIT", ""))}
             return Calibration.of(reduce_frames(registered, optics), **self.kept, **camera)
         except ValueError as error:  # any of the files can be the cause
-            raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
+            names = ", ".join(source.name for source in sources)
+            two = [source.name for source in sources[: len(frames) + len(pupils)] if source.n_exposures == 2]
+            hint = f"; n_images = 2 takes the two exposures of {two[0]} for two images" if two else ""
+            raise ValueError(f"{error} (files: {names}{hint})") from error
 
     def commanded(self, commands: Path, **camera: Any) -> Calibration:
         """Calibration with a fit of the bench, or without where the fit measures an unseen state no better."""

@@ -35,12 +35,13 @@ __all__ = ["CameraFile", "check_output", "read", "read_all", "write_phase"]
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
 _PIECE = 2**22  # pixels of exposures that are read at once
 _POSITIVE = ("WAVELEN", "DIMPLE", "EGAIN", "SATURATE")  # keywords whose value is above 0
-# Keywords of the exposure time, and of the window on the detector: its two ends, or where its rows and columns begin.
+# Keywords of the exposure time, and of the window on the detector: its ends, or where its rows and columns begin.
 _TIMES = "EXPTIME", "EXPOSURE", "ITIME", "TINT", "ESO DET DIT", "ESO DET SEQ1 DIT"
 _ENDS = "DETSEC", "CCDSEC", "SUBRECT"
 _STARTS = (("YORGSUBF", "XORGSUBF"), ("YSTART", "XSTART"), ("ESO DET WIN1 STRY", "ESO DET WIN1 STRX"),
            ("ESO DET WIN STARTY", "ESO DET WIN STARTX"))  # fmt: skip
 _WINDOWS = *_ENDS, *sum(_STARTS, ())
+_PER_SECOND = "/s", "/sec", "s-1", "s^-1", "s**-1"  # ends of units
 _SAME = 0.01  # relative difference of exposure times that is none
 _ALIKE = 5.0  # median absolute deviations by which two darks may differ
 # Header card of a phase map: no other file is replaced.
@@ -182,9 +183,9 @@ def read_all(
     (n, 2, ny, nx). Two units of a FITS file are the two images of an exposure, and so are two files. Three files
     or more are exposures. An array (2, ny, nx) holds two exposures; for the two images of one, set ``n_images=2``.
 
-    A dark or a map belongs to the frames of its shape, and to those whose window on the detector it contains, where
-    the headers state windows (DETSEC, CCDSEC, SUBRECT, XORGSUBF, ...). Of several darks, a frame gets those with the
-    same window and exposure time (EXPTIME, EXPOSURE, ...).
+    A dark or a map belongs to the frames of its shape. If headers state windows on the detector (DETSEC, CCDSEC,
+    SUBRECT, XORGSUBF, ...), it also belongs to the frames whose window it contains. Of several darks, a frame gets
+    those with the same window and exposure time (EXPTIME, EXPOSURE, ...).
 
     Bad are pixels that are NaN, infinite or beyond 1e38, are not 0 in a map, or are saturated in one exposure.
 
@@ -232,8 +233,8 @@ def read_all(
             if not any(_on_window(file, frame) for frame in (*frames, *clear)):
                 expected = " or ".join(map(str, sorted(shapes)))
                 raise ValueError(
-                    f"{name}: {file.name} has shape {file.images.shape[1:]}: expected {expected}, as the frames, or "
-                    "headers with DETSEC that state where their windows lie"
+                    f"{name}: {file.name} has shape {file.images.shape[1:]}: expected {expected}, as the frames, "
+                    "or headers with DETSEC that state where their windows lie"
                 )
     return (
         combined(frames, darks, maps, n_images),
@@ -543,7 +544,7 @@ def _window(file: CameraFile) -> tuple[int, int] | None:
             if (bottom - top + 1, right - left + 1) == file.images.shape[1:]:  # not so where pixels are binned
                 return top, left
     for keys in _STARTS:
-        starts = [file.header.get(key) for key in keys]
+        starts: list[Any] = [file.header.get(key) for key in keys]
         if all(isinstance(start, int | float) and float(start).is_integer() for start in starts):
             return int(starts[0]), int(starts[1])
     return None
@@ -557,19 +558,21 @@ def _on_window(file: CameraFile, frame: CameraFile) -> CameraFile | None:
     own, window = _window(file), _window(frame)
     if own is None or window is None or window[0] < own[0] or window[1] < own[1]:
         return None
-    rows, columns = (slice(first - start, first - start + n) for first, start, n in zip(window, own, shape, strict=True))
-    images = file.images[:, rows, columns]
+    row, column = window[0] - own[0], window[1] - own[1]
+    images = file.images[:, row : row + shape[0], column : column + shape[1]]
     cards = {key: frame.header[key] for key in _WINDOWS if key in frame.header}
     return replace(file, images=images, header={**file.header, **cards}) if images.shape[1:] == shape else None
 
 
 def relative_exposure(frame: CameraFile, clear_frame: CameraFile) -> float:
     """Exposure time of a frame over that of a clear frame; 1 where headers state none, or count per second."""
-    per_second = any(str(file.header.get("BUNIT", "")).strip().lower().endswith(("/s", "s-1", "/sec")) for file in (frame, clear_frame))
+    headers = frame.header, clear_frame.header
+    if any(str(header.get("BUNIT", "")).strip().lower().endswith(_PER_SECOND) for header in headers):
+        return 1.0
     for key in _TIMES:
-        times = frame.header.get(key), clear_frame.header.get(key)
-        if not per_second and all(isinstance(time, int | float) and 0 < time < np.inf for time in times):
-            return times[0] / times[1]
+        time, clear_time = (header.get(key, 0) for header in headers)
+        if all(isinstance(value, int | float) and 0 < value < np.inf for value in (time, clear_time)):
+            return float(time / clear_time)
     return 1.0
 
 

@@ -23,6 +23,8 @@ from zwfs.frames._outline import Circle, Details, outline, threshold
 __all__ = ["Placement", "RegisteredFrames", "register_frames"]
 
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
+_GAPS = 6, 2  # half of the pixels by which parts of a pupil are apart; less where two pupils are as close
+_MANY_BAD = 0.05  # of the pixels of an image: worth a word where no pupil is found
 _SMALLEST = 8  # pixels across a pupil: with fewer there is no outline
 _MARGIN = 0.25  # of the diameter: more of the dark surroundings adds nothing
 _TOUCHED = 0.01  # weight of a bad pixel from which on a point is bad
@@ -40,7 +42,7 @@ _UNLIT, _MOST_OF_IT = 0.2, 0.6  # light of a dead pixel over that around it, and
 # Why an image holds one pupil, or two.
 _WHY = {
     1: "because another image holds the other pupil, or phase_shifts has one value",
-    2: "because two images are needed, with different phase shifts",
+    2: "because two images are needed, with different phase shifts, and some pixels apart",
 }
 FRAMES, CLEAR_FRAMES = slice(0, 2), slice(2, 4)  # of the four images
 _LARGEST_TURN, _LARGEST_STRETCH = 6.0, 0.06  # degrees, and relative, of the second image
@@ -93,6 +95,8 @@ class Image:
     def of(cls, counts: NDArray, name: str, dark: Any = 0.0) -> Image:
         """Image of counts, (ny, nx), less the dark, in which bad pixels are not finite."""
         good = np.isfinite(counts)
+        if not good.any():
+            raise ValueError(f"{name} less the dark: all pixels are NaN or infinite: expected an image")
         return cls(nearest_good(counts, good), ~good, name, dark=dark)
 
 
@@ -323,7 +327,7 @@ def register_frames(
     masked, circles = (frames[0], frames[-1]), pupils
     formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in (masked, clear)]
     windows = [[image.window or () for image in pair] for pair in (masked, clear)]
-    stated = all(map(len, sum(windows, [])))
+    stated = all(image.window for image in (*masked, *clear))
     moved = formats[0] != formats[1] and not stated
     if moved or (stated and windows[0] != windows[1]):
         centers = np.array([circle[:2] for circle in pupils]) + windows[1] - windows[0] if stated else None
@@ -369,26 +373,35 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> l
     diameter, in pixels, may be given.
     """
     smooth = ndimage.gaussian_filter(image.counts, 1.0)
-    remark = ""
-    if image.bad.mean() > 0.5:
-        remark = f" ({image.bad.mean():.4g} of its pixels are marked as bad: expected a map that is 0 where good)"
+    remark = _on_bad(image)
     if np.ptp(smooth) <= 1e-9 * np.abs(smooth).max(initial=1e-300):
         raise ValueError(f"{image.name}: every pixel is {smooth.flat[0]:.6g}: expected light in a pupil{remark}")
-    level = threshold(smooth)
-    bright = ndimage.binary_opening(smooth > level, iterations=2)
-    # Gaps between segments, and vanes, divide a pupil.
-    bright = ndimage.binary_closing(np.pad(bright, 8), iterations=6)[8:-8, 8:-8]
-    labels, n_found = ndimage.label(bright)
-    areas = np.asarray(ndimage.sum_labels(bright, labels, np.arange(1, n_found + 1)))
-    largest = np.flatnonzero((areas > 0.25 * areas.max(initial=0)) & (areas.max(initial=0) >= 50)) + 1
-    if len(largest) != n_pupils:
+    level, numbers = threshold(smooth), list[int]()
+    bright = np.pad(ndimage.binary_opening(smooth > level, iterations=2), 8)
+    for n_closed in _GAPS:
+        labels, n_found = ndimage.label(ndimage.binary_closing(bright, iterations=n_closed)[8:-8, 8:-8])
+        areas = ndimage.sum_labels(labels > 0, labels, np.arange(1, n_found + 1))
+        largest = np.flatnonzero((areas > 0.25 * areas.max(initial=0)) & (areas.max(initial=0) >= 50)) + 1
+        numbers.append(len(largest))
+        if len(largest) == n_pupils:
+            break
+    else:
         raise ValueError(
-            f"{image.name}: {len(largest)} bright regions as large as a pupil: expected {n_pupils}, "
+            f"{image.name}: {numbers[0]} bright regions as large as a pupil: expected {n_pupils}, "
             f"{_WHY[n_pupils]}; give the positions, or look for stray light{remark}"
         )
     circles = [outline(smooth, labels == label, level, diameter) for label in largest]
     axis = int(np.argmax(np.ptp([circle[:2] for circle in circles], axis=0)))
     return sorted(circles, key=lambda circle: circle[axis])
+
+
+def _on_bad(image: Image) -> str:
+    """Remark for a message on an image with many bad pixels."""
+    share = image.bad.mean()
+    if share <= _MANY_BAD:
+        return ""
+    expected = "a map that is 0 where good, and a saturation above the light"
+    return f" ({share:.0%} of its pixels are marked as bad: expected {expected})"
 
 
 def register(
@@ -405,8 +418,8 @@ def register(
     Maximises the correlation of the two at the points `inside` the reference, after a band-pass that keeps gaps,
     vanes and edges but takes away noise, the illumination, and the grid of a deformable mirror, whose contrast
     depends on the focus of the camera. With `turn`, a rotation or magnification that the images do not determine
-    stays out: its standard error exceeds 0.05 pixels at the edge of `inside`, and a tenth of its value or that value
-    is beyond the range that is allowed.
+    stays out: its standard error exceeds 0.05 pixels at the edge of `inside`, and a tenth of its value or the value
+    exceeds what is allowed.
     """
     center = center or ((len(reference) - 1) / 2, (len(reference[0]) - 1) / 2)
     # Details of three times the width, at every third point, draw the search from farther away.
@@ -420,7 +433,7 @@ def register(
     start = min(moves, key=lambda move: float(np.sum(coarse.difference(move) ** 2)))
     if max(map(abs, start[:2])) == _REACH:
         reason = f"the best shift of the images is {start[:2]} pixels, the end of the search"
-        raise ValueError(f"{reason}: expected less than {_REACH}")
+        raise ValueError(f"{reason}: expected less than {_REACH}, and images that look alike")
     turns = np.array([False, False, True, True])
     free = turn | ~turns
     best, _ = coarse.search(np.array(start), free)
@@ -465,7 +478,7 @@ def _locate(
             raise ValueError(
                 f"{image.name}: the pupil {origin}at row {circle.row:.1f}, column {circle.column:.1f}, "
                 f"{circle.diameter:.1f} pixels wide, is cut off at the {side} (row 0 is the top): "
-                "expected all of it on the image"
+                f"expected all of it on the image{_on_bad(image)}"
             )
     first = _extend(pair[0], circles if shared else circles[:1])
     return (first, first if shared else _extend(pair[1], circles[1:])), (circles[0], circles[1])
@@ -478,8 +491,8 @@ def _n_bad(*images: Image) -> int:
 def _without_odd(images: Sequence[Image], others: Sequence[Image], *, clear: bool) -> tuple[Image, ...]:
     """Images with hot and dead pixels and lines marked as bad; `others` show them without or with the mask.
 
-    A group of bright pixels may be a poke on a frame, but is hot on a clear frame. A line without light may be a vane
-    on a clear frame, but is dead on a frame, where the mask sends light into it.
+    A group of bright pixels may be a poke on a frame, but is hot on a clear frame. A line without light may be a
+    vane on a clear frame, but is dead on a frame, where the mask sends light into it.
     """
     alike = [image.counts.shape for image in images] == [image.counts.shape for image in others]
     marked = []
@@ -515,7 +528,7 @@ def _groups(image: Image) -> NDArray[np.bool_]:
 
 
 def _lines(image: Image) -> NDArray[np.bool_]:
-    """Pixels of rows and columns that are brighter than those around them, and of those without light, (2, ny, nx)."""
+    """Pixels of lines that are brighter than those around them, and of lines without light, (2, ny, nx)."""
     counts, level = image.counts - np.median(image.counts), _half_lit(image.counts)
     odd = np.zeros((2, *counts.shape), bool)
     for axis in (0, 1):

@@ -38,7 +38,8 @@ _EDGE, _AROUND = 3, 8  # pixels around the pupil: those that take part where the
 _ODD_ON_BOTH, _ODD = 0.5, 3.0
 _FAINT = 0.01  # of the brightest light: a pixel that is off by less does no harm
 _BRIGHTER = 1.5  # light of hot pixels that stand together over that of a pupil
-_UNLIT, _MOST_OF_IT = 0.2, 0.6  # light of a dead pixel over that around it, and part of a line that is dead or hot
+_UNLIT, _MOST_OF_IT = 0.05, 0.6  # light of a dead line over that around it, and part of a hot line that is hot
+_FEW_LINES = 4
 # Why an image holds one pupil, or two.
 _WHY = {
     1: "because another image holds the other pupil, or phase_shifts has one value",
@@ -418,8 +419,8 @@ def register(
     Maximises the correlation of the two at the points `inside` the reference, after a band-pass that keeps gaps,
     vanes and edges but takes away noise, the illumination, and the grid of a deformable mirror, whose contrast
     depends on the focus of the camera. With `turn`, a rotation or magnification that the images do not determine
-    stays out: its standard error exceeds 0.05 pixels at the edge of `inside`, and a tenth of its value or the value
-    exceeds what is allowed.
+    stays out: its standard error exceeds 0.05 pixels at the edge of `inside`, and a tenth of its value unless that
+    is larger than allowed.
     """
     center = center or ((len(reference) - 1) / 2, (len(reference[0]) - 1) / 2)
     # Details of three times the width, at every third point, draw the search from farther away.
@@ -521,30 +522,36 @@ def _outstanding(image: Image) -> NDArray[np.float64]:
 
 def _groups(image: Image) -> NDArray[np.bool_]:
     """Pixels of groups of a few that are brighter than those around them, and than the light of a pupil."""
-    counts, level, ring = image.counts, _half_lit(image.counts), np.pad(np.zeros((3, 3)), 1, constant_values=1)
-    dark = np.median(counts)
-    brighter = counts - dark > _BRIGHTER * (np.median(counts[counts > dark + level]) - dark)
-    return brighter & (counts - ndimage.rank_filter(counts, -4, footprint=ring) > level)
+    counts, light = _above_dark(image)
+    ring = np.pad(np.zeros((3, 3)), 1, constant_values=1)
+    return (counts > _BRIGHTER * light) & (counts - ndimage.rank_filter(counts, -4, footprint=ring) > light / 2)
 
 
 def _lines(image: Image) -> NDArray[np.bool_]:
-    """Pixels of lines that are brighter than those around them, and of lines without light, (2, ny, nx)."""
-    counts, level = image.counts - np.median(image.counts), _half_lit(image.counts)
+    """Pixels of lines that are brighter than those around them, and of lines without light, (2, ny, nx).
+
+    Many lines are the gaps of a mirror of segments, and not faults of a camera.
+    """
+    counts, light = _above_dark(image)
     odd = np.zeros((2, *counts.shape), bool)
     for axis in (0, 1):
         lines = np.moveaxis(counts, axis, 0)
         sides = [np.roll(lines, step, axis=0) for step in (-3, -2, 2, 3)]
         lowest, highest = np.min(sides, axis=0), np.max(sides, axis=0)
-        lit = lowest > level
-        hot = np.mean(lines - highest > level, axis=1)
-        dead = np.sum(lit & (lines < _UNLIT * lowest), axis=1) / np.maximum(np.sum(lit, axis=1), _SMALLEST)
-        np.moveaxis(odd, axis + 1, 1)[:] |= (np.stack([hot, dead]) > _MOST_OF_IT)[..., np.newaxis]
+        lit = lowest > light / 2
+        hot = np.mean(lines - highest > light / 2, axis=1) > _MOST_OF_IT
+        dead = np.sum(lines, axis=1, where=lit) < _UNLIT * np.sum(lowest, axis=1, where=lit)
+        for which, index in ((hot, 0), (dead & (np.count_nonzero(lit, axis=1) >= _SMALLEST), 1)):
+            if np.count_nonzero(which) <= _FEW_LINES:
+                np.moveaxis(odd[index], axis, 0)[which] = True
     return odd
 
 
-def _half_lit(counts: NDArray) -> float:
-    """About half of the light of a pupil, over its surroundings."""
-    return threshold(counts) - float(np.median(counts))
+def _above_dark(image: Image) -> tuple[NDArray[np.float64], float]:
+    """Counts above those of dark pixels, and those of a typical lit one."""
+    lit = image.counts > threshold(image.counts)
+    dark, light = (float(np.median(image.counts[which])) if which.any() else 0.0 for which in (~lit, lit))
+    return image.counts - dark, light - dark
 
 
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:

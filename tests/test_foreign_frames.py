@@ -174,6 +174,13 @@ def test_windows_and_times_of_the_headers_place_and_scale_frames(arms, tmp_path,
     assert arms_error(arms, fits.getdata("phase.fits")[0], corner) < 0.015
 
 
+def test_clear_frames_of_another_window_are_placed_without_a_header(arms):
+    _, _, frame, clear, _ = arms
+    phases = phase_of(frame, clear[2:-3, 1:-2])
+    origins = phases.measurement.registered.origins
+    np.testing.assert_allclose(origins[:2] - origins[2:], [[2, 1]] * 2, atol=1e-9)
+
+
 def spoiled(arms, kind):
     """Frame and clear frame with a fault."""
     frame, clear = arms[2].copy(), arms[3].copy()

@@ -271,8 +271,9 @@ def register_frames(
 
     The second clear frame is registered to the first. Frames are taken to stand at the same place of the detector
     as the clear frames: the camera has not moved. If they are of another format and the windows of both on the
-    detector are not known, the pupils are located on them, too, and each is registered to its clear frame. That is
-    less reliable, because the phase changes the look of gaps and edges.
+    detector are not known, the pupils are located on them, too. Where one image holds both pupils, both have moved
+    by the same number of whole pixels. Otherwise each frame is registered to its clear frame. That is less reliable,
+    because the phase changes the look of gaps and edges.
 
     Hot and dead pixels that are not yet marked as bad are found and marked: they are brighter or darker than all
     their neighbours but one, by much on one image or by less on frame and clear frame alike.
@@ -338,6 +339,8 @@ def register_frames(
             raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
     places = np.array([circle[:2] for circle in (*circles, *pupils)])
     origins = np.round(places - places[2])
+    if moved and masked[0] is masked[1] and clear[0] is clear[1]:
+        origins[:2] = origins[2:] + np.mean(places[:2] - places[2:], axis=0)
     rough = RegisteredFrames(masked, clear, pupils, origins, background, balance, exposure, n_odd=n_odd)
     return _register(rough, frames_too=moved) if subpixel else rough
 
@@ -585,6 +588,13 @@ def _register(rough: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
     if not frames_too:
         return placed
     (frames, _), (images, _) = (placed._on_grid(which) for which in (FRAMES, CLEAR_FRAMES))
+    if placed.frames[0] is placed.frames[1] and placed.clear_frames[0] is placed.clear_frames[1]:
+        # What opposite phase shifts change at the edge of the pupil, and in it, is smaller in the mean.
+        inside = radius(images.shape[1:], placed.center) <= placed.diameter / 2 + _EDGE
+        move = register(frames.mean(axis=0), images.mean(axis=0), inside, placed.center).shift
+        # The outlines err in other ways than the content, so that their mean is better than each.
+        origins[:2] = origins[2:] + np.round(origins[0] - origins[2] + move / 2)
+        return replace(placed, origins=origins)
     # Off the edge, which the mask makes bright or dark.
     inside = radius(images.shape[1:], placed.center) <= 0.45 * placed.diameter
     moves = [

@@ -272,8 +272,8 @@ def register_frames(
     The second clear frame is registered to the first. Frames are taken to stand at the same place of the detector
     as the clear frames: the camera has not moved. If they are of another format and the windows of both on the
     detector are not known, the pupils are located on them, too. Where one image holds both pupils, both have moved
-    by the same number of whole pixels. Otherwise each frame is registered to its clear frame. That is less reliable,
-    because the phase changes the look of gaps and edges.
+    by the same number of whole pixels. Otherwise each frame is registered to its clear frame. That is less
+    reliable, because the phase changes the look of gaps and edges.
 
     Hot and dead pixels that are not yet marked as bad are found and marked: they are brighter or darker than all
     their neighbours but one, by much on one image or by less on frame and clear frame alike.

@@ -45,7 +45,7 @@ _UNEVEN = 0.03  # difference of the two flux ratios that is worth a word
 _EXCESS = 0.02  # light around the pupil, 1 = mean of the pupil, that is worth a word
 _MANY = 0.01  # of the points
 _MOST_LIGHT = 1.1  # in the pupil, 1 = that of the clear frames
-_FEW, _MOST = 0.02, 0.6  # part of the points that is worth a word if it holds most of the squared misfit
+_FEW, _MOST = 0.02, 0.9  # part of the points that is worth a word if it holds most of the squared misfit
 _TURNED = 5.0  # standard errors: a rotation or magnification beyond them is real
 _ONE_IMAGE = (
     "Not decided: one image fits nearly any phase. It cannot show whether the phase is on the right branch of the "

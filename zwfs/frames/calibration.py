@@ -210,7 +210,8 @@ class Calibration(Immutable):
             With commands, called with a short text before each step of the fit.
         **settings
             Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
-            commands only the first two.
+            commands only the first two. By default the exposure is the ratio of the times that the headers state,
+            see `zwfs.frames.files.read_all`, or 1.
 
         Raises
         ------

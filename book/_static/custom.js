@@ -1,10 +1,3 @@
-// Text that holds mathematics appears once that is set, so that nothing moves afterwards.
-document.documentElement.classList.add("setting");
-addEventListener("load", async () => {
-  await window.MathJax?.startup?.promise;
-  document.documentElement.classList.remove("setting");
-});
-
 // Browsers block pages from the file system from reading other files: a search there shows no summaries.
 if (location.protocol === "file:") DOCUMENTATION_OPTIONS.SHOW_SEARCH_SUMMARY = false;
 

@@ -1,7 +1,9 @@
 """The built book in a real browser, opened from the file system, as wide as a screen and as a phone."""
 
 import json
+from pathlib import Path
 from types import SimpleNamespace
+from urllib.parse import unquote, urlsplit
 
 import pytest
 
@@ -83,6 +85,11 @@ def test_says_nothing_and_asks_nobody(opened):
     assert opened.said == []
     assert opened.asked
     assert outside(opened.asked) == []
+
+
+def test_opening_a_page_loads_little(opened):
+    files = {Path(unquote(urlsplit(url).path)) for url in opened.asked if url.startswith("file:")}
+    assert sum(file.stat().st_size for file in files) <= 1.25e6  # 1.2 MB in a window of 1280 x 720 pixels
 
 
 def test_equations_are_rendered(opened):

@@ -57,7 +57,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     for image in body.find_all("img"):
         if picture := pictures.get(unquote(image["src"].rpartition("/")[2])):
             image["width"], image["height"] = map(str, size(picture))
-    for image in body.find_all("img")[1:]:
+    for image in body.find_all("img"):
         image["loading"] = "lazy"
     for image in body.select("figure > img"):
         image.wrap(body.new_tag("a", href=image["src"], title="Open the figure alone"))

@@ -1,3 +1,7 @@
+// The theme sets its colours late: boxes would grow by their borders, and a dark page would load the light pictures.
+if (document.documentElement.dataset.mode === "auto")
+  document.documentElement.dataset.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
+
 // Browsers block pages from the file system from reading other files: a search there shows no summaries.
 if (location.protocol === "file:") DOCUMENTATION_OPTIONS.SHOW_SEARCH_SUMMARY = false;
 

@@ -1,4 +1,4 @@
-"""Makes book/_static/math.woff2, the font of formulas, from a part of STIX Two Math.
+"""Makes book/_ext/math.woff2, the font of formulas, from a part of STIX Two Math.
 
     uv run --with fonttools[woff]==4.68.0 --with ziamath==0.13 environment/font.py
 
@@ -15,7 +15,7 @@ from fontTools.subset import Options, Subsetter, parse_unicodes
 from fontTools.ttLib import TTFont
 
 SOURCE = files("ziamath") / "fonts" / "STIXTwoMath-Regular.ttf"
-TARGET = Path(__file__).parents[1] / "book" / "_static" / "math.woff2"
+TARGET = Path(__file__).parents[1] / "book" / "_ext" / "math.woff2"
 LETTERS = """
     20-7E,A0,AF,B1,B7,D7,131,237,2C6,2C7,2D8,2D9,2DC,300-304,305,307,308,332,391-3A9,3B1-3C9,3D1,3D5,3F5,
     2016,2026,2032,2033,203E,2061-2064,210B-210E,2110-2113,211B,211C,212C,2130,2131,2133,2190-2194,21A6,21D2,

@@ -1,5 +1,9 @@
 """Formulas as MathML, which browsers draw and screen readers speak without a program."""
 
+import base64
+from pathlib import Path
+from typing import Any
+
 from docutils import nodes
 from math_core import LatexError, LatexToMathML
 from sphinx.application import Sphinx
@@ -10,6 +14,8 @@ from sphinx.writers.html5 import HTML5Translator
 
 CLASSES = "math notranslate nohighlight"
 CONVERTER = LatexToMathML(fancy_error=False)
+STYLE = Path(__file__).with_name("math.css")
+FONT = STYLE.with_suffix(".woff2")
 LOGGER = logging.getLogger(__name__)
 
 
@@ -39,7 +45,23 @@ def mathml(node: nodes.math | nodes.math_block) -> str:
         return nodes.unescape(node.astext())
 
 
+def add_style(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: nodes.document) -> None:
+    """Load the style of formulas on pages that have some."""
+    if "<math" in context.get("body", ""):
+        app.add_css_file(STYLE.name)
+
+
+def write_style(app: Sphinx, exception: Exception | None) -> None:
+    """Write the style of formulas, with its font in it: a font that arrives later moves the text."""
+    if exception is None and app.builder.format == "html":
+        font = f"data:font/woff2;base64,{base64.b64encode(FONT.read_bytes()).decode()}"
+        style = STYLE.read_text("utf-8").replace(FONT.name, font)
+        Path(app.outdir, "_static", STYLE.name).write_text(style, "utf-8")
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Offer the renderer, which `html_math_renderer` names."""
     app.add_html_math_renderer("mathml", (visit_inline, None), (visit_block, None))
+    app.connect("html-page-context", add_style)
+    app.connect("build-finished", write_style)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

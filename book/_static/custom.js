@@ -5,11 +5,12 @@ if (document.documentElement.dataset.mode === "auto")
 // Browsers block pages from the file system from reading other files: a search there shows no summaries.
 if (location.protocol === "file:") DOCUMENTATION_OPTIONS.SHOW_SEARCH_SUMMARY = false;
 
-// Tables that are wider than the page scroll: only those are a stop for the Tab key, with a name.
-function nameWideTables() {
-  for (const box of document.querySelectorAll(".pst-scrollable-table-container")) {
+// Tables and formulas that are wider than the page scroll: only those are a stop for the Tab key, with a name.
+function nameWideBoxes() {
+  for (const box of document.querySelectorAll(".pst-scrollable-table-container, .formula")) {
     const wide = box.scrollWidth > box.clientWidth;
-    for (const [name, value] of Object.entries({ tabindex: "0", role: "group", "aria-label": "Table" })) {
+    const label = box.matches(".formula") ? "Formula" : "Table";
+    for (const [name, value] of Object.entries({ tabindex: "0", role: "group", "aria-label": label })) {
       if (wide) box.setAttribute(name, value);
       else box.removeAttribute(name);
     }
@@ -23,7 +24,7 @@ function fadeWideBoxes() {
 }
 
 for (const event of ["load", "resize"]) {
-  addEventListener(event, nameWideTables);
+  addEventListener(event, nameWideBoxes);
   addEventListener(event, fadeWideBoxes);
 }
 addEventListener("scroll", fadeWideBoxes, { capture: true, passive: true });

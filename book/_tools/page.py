@@ -20,7 +20,6 @@ from .notebook import to_bytes
 from .project import Project
 
 STYLE = Path(__file__).with_name("standalone.css")
-FONT = "math.woff2"
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 MATHEMATICS = "book._ext.mathematics"
 # Extensions for the other pages of the book and for its navigation.
@@ -144,10 +143,9 @@ def _embed(output: Path, document: str, published: set[str], changed: bool) -> s
             link.unwrap()
     sheets = [sheet["href"].partition("?")[0] for sheet in soup.find_all("link", rel="stylesheet")]
     style = [(file.parent / sheet).read_text("utf-8") for sheet in sheets if not urlsplit(sheet).scheme]
-    letters = Path(__file__).parents[1] / "_static" / FONT
     return FRAME.format(
         title=html.escape(body.find("h1").get_text()),
-        style="\n".join([*style, STYLE.read_text("utf-8").replace(FONT, _data(letters))]),
+        style="\n".join([*style, STYLE.read_text("utf-8")]),
         body="".join(map(str, body.contents)),
     )
 

@@ -5,6 +5,10 @@ if (document.documentElement.dataset.mode === "auto")
 // Browsers block pages from the file system from reading other files: a search there shows no summaries.
 if (location.protocol === "file:") DOCUMENTATION_OPTIONS.SHOW_SEARCH_SUMMARY = false;
 
+// Text with formulas appears once their font is set, so that nothing moves afterwards.
+document.documentElement.classList.add("setting");
+document.fonts.load('1em "STIX Two Math"').finally(() => document.documentElement.classList.remove("setting"));
+
 // Tables and formulas that are wider than the page scroll: only those are a stop for the Tab key, with a name.
 function nameWideBoxes() {
   for (const box of document.querySelectorAll(".pst-scrollable-table-container, .formula")) {

@@ -128,7 +128,8 @@ class Grid:
         pairs = calibration.dark, calibration.bad
         dark, bad = (np.stack([maps[i][rows][:, columns] for i, rows, columns in self.boxes]) for maps in pairs)
         self.dark, self.bad = dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32), bad
-        corners, inside = places - low[:, :, np.newaxis], self.reconstruct.sensor.pupil.inside.ravel().astype(float)
+        corners = places - low[:, :, np.newaxis]
+        inside = self.reconstruct.sensor.pupil.inside.ravel().astype(float)
         self.touching = [_interpolation(place, size, 1, inside) for place in corners]  # from all pixels of a box
         self._corners = corners.reshape(points.shape)
         self.splines = [_interpolation(place - _CUT, size - 2 * _CUT, 3, self._near) for place in corners]

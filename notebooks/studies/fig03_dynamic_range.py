@@ -363,8 +363,7 @@ def findings_two_images(curves: LinearityCurves, descents: LinearityCurves, thre
     return Text(
         f"At {curves.rms[place]:.3g} rad rms, the iteration recovers {shifted:.0%} of the screens, gradient "
         f"descent on modes {modes:.0%}, and gradient descent with the phase of each point as an unknown "
-        f"{points:.0%}. The mean Strehl ratio is {two_digits(curves.strehl[place].mean())} there. At least half "
-        f"of the screens have phase wraps, points beyond ±π, {wraps}."
+        f"{points:.0%}. At least half of the screens have phase wraps, points beyond ±π, {wraps}."
     )
 
 

@@ -2,7 +2,7 @@
 
 Two images hold two numbers for the phase of each point, so images at a wrong place leave residuals that no phase
 explains. Their slopes, each with the phase solved again, give the displacement that makes them least. For images
-that are less than half a pixel away it is exact to 0.15 pixel. The displacement of the rim of the pupil leads to there.
+that are less than half a pixel away it is exact to 0.15 pixel. The rim of the pupil shows the way to there.
 """
 
 from __future__ import annotations

@@ -1,6 +1,8 @@
 """Formulas as MathML, which browsers draw and screen readers speak without a program."""
 
 import base64
+import html
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ CLASSES = "math notranslate nohighlight"
 CONVERTER = LatexToMathML(fancy_error=False)
 STYLE = Path(__file__).with_name("math.css")
 FONT = STYLE.with_suffix(".woff2")
+SPACING = re.compile(r"(?<=\\\\)\[[\d.]+e[mx]\]")  # after a row: math-core would print it
 LOGGER = logging.getLogger(__name__)
 
 
@@ -38,11 +41,12 @@ def visit_block(translator: HTML5Translator, node: nodes.math_block) -> None:
 
 def mathml(node: nodes.math | nodes.math_block) -> str:
     """Return a formula as MathML; warn of a formula that cannot be read, and return it as it is written."""
+    text = SPACING.sub("", node.astext())
     try:
-        return CONVERTER.convert_with_local_state(node.astext(), displaystyle=isinstance(node, nodes.math_block))
+        return CONVERTER.convert_with_local_state(text, displaystyle=isinstance(node, nodes.math_block))
     except LatexError as error:
-        LOGGER.warning("formula %r: %s", node.astext(), error, location=node)
-        return nodes.unescape(node.astext())
+        LOGGER.warning("formula %r: %s", text, error, location=node)
+        return html.escape(text)
 
 
 def add_style(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: nodes.document) -> None:

@@ -229,8 +229,8 @@ def test_frames_that_no_phase_explains_give_a_warning(arms):
 def test_verdict_names_cosmic_rays(arms):
     _, _, frame, clear, _ = arms
     frame = frame.copy()
-    frame[22:25, 24] += 6000
-    frame[33, 30:34] += 6000
+    frame[18:21, 28:30] += 9000
+    frame[36, 30:34] += 9000
     assert "cosmic rays" in judge(phase_of(frame, clear)).findings["warnings"]
 
 

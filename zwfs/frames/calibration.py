@@ -374,7 +374,7 @@ class Calibration(Immutable):
         errors = sideways(calibration.sensor, phase[0], frames[0], good)[np.newaxis]
         shift = calibration._work.displaced(phase, frames, good[np.newaxis])[0]
         residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
-        if remark := doubt(measurement, float(residual[0])):
+        if remark := doubt(measurement, phase[0]):
             warnings.warn(remark, stacklevel=3)
         return replace(
             calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,

@@ -603,14 +603,17 @@ def upside_down(measurement: Measurement) -> Measurement:
     return replace(measurement, intensity=intensity, bad=bad, gain=gain)
 
 
-def doubt(measurement: Measurement, residual: float) -> str:
-    """Say that frames do not belong to their model, whose rms residual is given; empty if it is small.
-
-    The noise follows from neighbours, so that it holds a part of the edges of the pupil.
-    """
-    frames = measurement.measured[(..., *measurement.window)]
-    rough = [ndimage.convolve(frame, np.outer(_SECOND, _SECOND) / 6, mode="nearest") for frame in frames]
-    noise = 1.48 * np.median(np.abs(rough)[:, measurement.good])
+def doubt(measurement: Measurement, phase: NDArray) -> str:
+    """Say that frames do not belong to their model with a phase (ny, nx); empty if they do, off the edges."""
+    agreement, far = measurement.agreement(phase), measurement.good & ~near_edges(measurement)
+    if not far.any():
+        return ""
+    measured, modelled = (
+        frames[(..., *measurement.window)] for frames in (agreement.measured, agreement.modelled)
+    )
+    residual = float(np.sqrt(np.mean((measured - modelled)[:, far] ** 2)))
+    rough = [ndimage.convolve(frame, np.outer(_SECOND, _SECOND) / 6, mode="nearest") for frame in measured]
+    noise = 1.48 * np.median(np.abs(rough)[:, far])
     if residual < max(_DOUBTFUL, _UNLIKE * noise):
         return ""
     return (

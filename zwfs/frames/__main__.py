@@ -73,7 +73,7 @@ def _add_calibrate(parser: argparse.ArgumentParser) -> None:
     add("--pupil-diameter", type=float, metavar="PIXEL", help="default: from the clear frames")
     trust: Any = {"dest": "subpixel", "action": "store_false", "default": absent}
     add("--no-registration", help="trust the outlines", **trust)
-    add("--exposure", type=float, default=absent, help="of the frames over that of the clear frames: 1")
+    add("--exposure", type=float, default=absent, help="of frames over that of clear frames; default: EXPTIME")
     add("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
     add("--fit", dest="fitted", nargs="+", default=(), metavar="NAME", help="parameter to fit")
     add("--commands", metavar="FILE", help="known phases of the frames, radian: fit the bench with them")
@@ -99,6 +99,7 @@ def _add_reconstruct(parser: argparse.ArgumentParser) -> None:
     add("--keywords", nargs="+", default=(), metavar="KEY", help="of the headers, for the table")
     add("--saturation", type=float, metavar="COUNTS", help="default: that of the calibration")
     add("--largest-residual", type=float, metavar="RMS", help="of a consistent frame")
+    add("--follow", action="store_true", help="move images back that have moved since the calibration")
     add("--workers", dest="n_workers", type=int, metavar="N", help="default: one for each core")
     add("--restart", action="store_true", help="drop the part of an interrupted run")
     add("--overwrite", action="store_true", help="replace any file")

@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import math
+import warnings
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -31,12 +32,13 @@ from zwfs.frames._errors import Excess, sideways, slopes_of
 from zwfs.frames._exposures import Exposures
 from zwfs.frames._fit import BenchFit, fit_bench
 from zwfs.frames._fitted import WIDEST, smooth_phases
+from zwfs.frames._follow import checked_follow, followed
 from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._solver import MapPrior
 from zwfs.frames.controller import Controller, PhaseController, make_controller
 from zwfs.frames.phases import Flag, Phases
-from zwfs.frames.pipeline import Measurement, Optics, ideal_frames, measured
+from zwfs.frames.pipeline import Measurement, Optics, doubt, ideal_frames, measured
 from zwfs.frames.registration import FRAMES
 from zwfs.metrics import without_piston
 from zwfs.reconstructors.base import Reconstructor
@@ -209,7 +211,8 @@ class Calibration(Immutable):
             With commands, called with a short text before each step of the fit.
         **settings
             Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
-            commands only the first two.
+            commands only the first two. By default the exposure is the ratio of the times that the headers state,
+            see `zwfs.frames.files.read_all`, or 1.
 
         Raises
         ------
@@ -251,7 +254,8 @@ class Calibration(Immutable):
     @classmethod
     def from_arrays(
         cls, frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, *,
-        saturation: float = np.inf, n_iterations: int = 25, tolerance: float = 1e-3, **optics: Any,
+        saturation: float = np.inf, exposure: float = 1.0, n_iterations: int = 25, tolerance: float = 1e-3,
+        **optics: Any,
     ) -> Calibration:  # fmt: skip
         """Calibration from a pair of frames as those to come, and from clear frames.
 
@@ -259,11 +263,14 @@ class Calibration(Immutable):
         ----------
         frames, clear_frames : array_like, shape (ny, nx) or (2, ny, nx), counts
             One camera image with both pupils, or one for each: with the mask in, and with the mask out. With one
-            phase shift, one image with one pupil. NaN marks bad pixels. Average several exposures first.
+            phase shift, one image with one pupil. NaN, or the mask of a masked array, marks bad pixels. Average
+            several exposures first.
         dark : array_like, shape (ny, nx) or (2, ny, nx), counts, optional
             Counts without light, which are subtracted from both, and from the frames to come.
         saturation, n_iterations, tolerance : float, counts; int; float, radian
-            Attributes of the calibration.
+            Attributes of the calibration. Pixels that reach the saturation are bad, the dark included.
+        exposure : float
+            Exposure of the frames over that of the clear frames.
         **optics
             Parameters of `Optics`, such as `diameter` and `phase_shifts`, or `masks`.
 
@@ -273,7 +280,8 @@ class Calibration(Immutable):
             If a shape is wrong, or the pupils are not found.
         """
         attributes = {"saturation": saturation, "n_iterations": n_iterations, "tolerance": tolerance}
-        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), **attributes)
+        measurement = measured(frames, clear_frames, dark, Optics(**optics), saturation, exposure)
+        return cls.of(measurement, **attributes)
 
     @classmethod
     def fit(
@@ -337,7 +345,8 @@ class Calibration(Immutable):
         Parameters
         ----------
         measurement : Measurement
-            Of frames that are taken as those to come, and of clear frames. Its images know the dark.
+            Of frames that are taken as those to come, and of clear frames. Its images know the dark. If no phase
+            explains them, there is a warning.
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
         """
@@ -365,6 +374,8 @@ class Calibration(Immutable):
         errors = sideways(calibration.sensor, phase[0], frames[0], good)[np.newaxis]
         shift = calibration._work.displaced(phase, frames, good[np.newaxis])[0]
         residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
+        if remark := doubt(measurement, phase[0]):
+            warnings.warn(remark, stacklevel=3)
         return replace(
             calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
             residual=float(residual[0]), light_ratio=float(ratio[0]),
@@ -433,7 +444,7 @@ class Calibration(Immutable):
         self, counts: ArrayLike, start: NDArray | None = None, *, light: ArrayLike | None = None,
         saturation: float | None = None,
         largest_residual: float | None = None, judge: bool = True, method: Reconstructor | None = None,
-        smooth: bool | MapPrior = False, noise: ArrayLike | None = None,
+        smooth: bool | MapPrior = False, noise: ArrayLike | None = None, follow: bool = False,
     ) -> Phases:  # fmt: skip
         """Phases of camera images.
 
@@ -468,6 +479,11 @@ class Calibration(Immutable):
         noise : float or array_like, shape (ny, nx) or (n_images, ny, nx), counts rms, optional
             Of the pixels, with `smooth`. By default it follows from the counts, and from gain and noise of the
             `bench`; that of means of several frames is smaller.
+        follow : bool
+            Whether images that have moved since the calibration by 0.1 to 3 pixels, both by the same rows and
+            columns, are moved back and reconstructed again, at most three times. Bad pixels and the dark stay in
+            place. Where this lowers the residual by less than a fifth, the images are not moved, and `MOVED` may
+            stay. An exposure that has moved takes 0.1 s with a pupil of 40 pixels, and 0.5 s with one of 90.
         """
         counts = _check.plain_array("counts", counts)
         if counts.dtype.kind not in "biuf":
@@ -479,11 +495,14 @@ class Calibration(Immutable):
             raise ValueError(f"counts has shape {counts.shape}: expected at least one exposure")
         saturation = self.saturation if saturation is None else _check.number_or_inf("saturation", saturation)
         level, judge = min(saturation, _check.LARGEST), _check.flag("judge", judge)
+        if checked_follow(follow, self) and not judge:
+            raise ValueError("follow = True with judge = False: expected judge = True, as it needs the residual")
         if largest_residual is not None:
             largest_residual = _check.number_or_inf("largest_residual", largest_residual)
         counts = counts.reshape(-1, self.n_images, *self.shape)
         if smooth is not False or noise is not None:
             options = {"start": start, "light": light, "largest_residual": largest_residual, "method": method}
+            options["follow"] = follow or None
             for name, value in options.items():
                 if value is not None:
                     raise ValueError(f"{name} with smooth or noise: expected none")
@@ -503,7 +522,8 @@ class Calibration(Immutable):
             piece = slice(first, first + _PIECE)
             begin, lamp = (None if values is None else values[piece] for values in (start, light))
             exposures = Exposures(self, counts[piece], level, begin, method, judge)
-            parts.append(exposures.phases(lamp, largest_residual))
+            limits = lamp, largest_residual
+            parts.append(followed(exposures, *limits) if follow else exposures.phases(*limits))
         return Phases._joined(parts, batch)
 
     def controller(

@@ -25,11 +25,12 @@ _LAMP = (
     0.85,
     1.7,
 )  # light in the pupil, over that of the calibration's frames, that other phases can make of its lamp
-_UNUSUAL = 2.5  # times the residual of the calibration's frames: a larger one is inconsistent
 _EXACT = 1e-3  # residual of frames without noise
 _MOVED_BY, _SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
 _SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
-_ENOUGH = 2.25  # cost of an explanation that is good enough
+# Cost of an explanation that is good enough, and factor of the usual residual from which on frames are inconsistent.
+_ENOUGH = 2.25, 2.5
+_ENOUGH_OF_BENCH = 1.56, 1.25  # where the noise is known
 _PASSES = 4  # in which the light of the modelled frames gives the next light
 _STEPS = 0.08, 0.08, 0.04, 0.02, 0.01  # relative changes of the light
 _BETTER = 0.8  # of the cost: a smaller gain moves no light
@@ -48,6 +49,7 @@ class Trial(NamedTuple):
     converged: NDArray[np.bool_]  # (k,)
     n_unsolved: NDArray[np.int64]  # (k,)
     residual: NDArray[np.float32]  # (k,), NaN if not judged
+    usual: NDArray[np.float64]  # (k,), of frames like those of the calibration
     ratio: NDArray[np.float64]  # (k,), light of the frames over that of their model
     cost: NDArray[np.float64]  # (k,), of both: 1 for frames like those of the calibration
 
@@ -72,7 +74,9 @@ class Exposures:
     ) -> None:  # fmt: skip
         self._of, self._work, k = calibration, calibration._work, len(counts)
         self._start, self._method, self._judge = start, method, judge
-        values, self.good, self.n_bad, self.n_saturated = self._work.on_grid(counts, level, calibration.good)
+        self._enough, self._unusual = _ENOUGH if calibration.bench is None else _ENOUGH_OF_BENCH
+        self._raw, self.good, self.n_bad, self.n_saturated = self._work.cleaned(counts, level, calibration.good)
+        values = self._work.resampled(self._raw, self._work.filters)
         self.n_good = np.maximum(np.count_nonzero(self.good, axis=(1, 2)), 1)
         sums = np.vecdot(values, self.good.reshape(k, 1, -1).astype(np.float32))
         flux = sums / (self.n_good[:, np.newaxis] * calibration.unit)
@@ -93,7 +97,7 @@ class Exposures:
         if light is None and self._judge:
             self._explain(trial)
         residual, displacement, moved = self._compared(trial)
-        limits = _UNUSUAL * self._usual(trial.light, self.noise) if limit is None else limit
+        limits = self._unusual * trial.usual if limit is None else limit
         flags = _BAD * (self.n_bad > 0) + _SATURATED * (self.n_saturated > 0) + _INCONSISTENT * (residual > limits)
         flags += np.where(self.lit, _NOT_CONVERGED * (~trial.converged & (self._of.tolerance > 0)), _LOST)
         return Phases(
@@ -116,30 +120,37 @@ class Exposures:
         frames[~self.lit[which]] = work.flat_frames  # of a flat wavefront: they converge at once
         if self._method is None:
             np.maximum(frames, 0, out=frames)
-        solved = work.solve(frames, good, None if self._start is None else self._start[which], self._method)
-        residual, ratio = np.full((2, len(which)), np.nan)
+        start, prediction = None if self._start is None else self._start[which], self._of._prediction
+        usual, residual, ratio = self._usual(light, self.noise[which]), *np.full((2, len(which)), np.nan)
+        solved = work.solve(frames, good, start, None if prediction else self._method)
+        if prediction:
+            frames, solved, missing, noise = prediction.corrected(self._raw[which], light, self.lit[which], good, solved)
+            usual = np.maximum(noise, max(self._of.residual, _EXACT))
+            if self._method:
+                solved = work.solve(frames, good, start, self._method)
         if self._judge:
             residual, ratio = work.compared(solved.phase, frames, good)
-        ratio, usual = ratio / self._of.light_ratio, self._usual(light, self.noise[which])
+            residual = missing if prediction else residual
+        ratio = ratio / self._of.light_ratio
         unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(self.n_good[which]))
         cost = np.where(self.lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)
-        return Trial(light, solved.phase, frames, *solved[1:], residual, ratio, cost)
+        return Trial(light, solved.phase, frames, *solved[1:], residual, usual, ratio, cost)
 
     def _explain(self, best: Trial) -> None:
         """Improve the light of those exposures that their first light does not explain."""
-        poor = np.flatnonzero(best.cost > _ENOUGH)
+        poor = np.flatnonzero(best.cost > self._enough)
         for _ in range(_PASSES):
             if not poor.size:
                 return
             better = best.improved(poor, self._attempt(poor, best.light[poor] * best.ratio[poor]))
-            poor = poor[better & (best.cost[poor] > _ENOUGH)]
-        poor = np.flatnonzero(best.cost > _ENOUGH)
+            poor = poor[better & (best.cost[poor] > self._enough)]
+        poor = np.flatnonzero(best.cost > self._enough)
         for step in _STEPS:
             if not poor.size:
                 return
             for factor in (1 - step, 1 + step):
                 best.improved(poor, self._attempt(poor, best.light[poor] * factor), _BETTER)
-            poor = poor[best.cost[poor] > _ENOUGH]
+            poor = poor[best.cost[poor] > self._enough]
 
     def _compared(self, trial: Trial) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """Residuals, displacements, and whether an exposure has moved; NaN where it is lost or not judged."""

@@ -33,6 +33,7 @@ from zwfs.frames._fit import BenchFit, fit_bench
 from zwfs.frames._fitted import WIDEST, smooth_phases
 from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import of_bench
+from zwfs.frames._prediction import Prediction
 from zwfs.frames._solver import MapPrior
 from zwfs.frames.controller import Controller, PhaseController, make_controller
 from zwfs.frames.phases import Flag, Phases
@@ -643,6 +644,10 @@ class Calibration(Immutable):
     @cached_property
     def _work(self) -> Grid:
         return Grid(self)
+
+    @cached_property
+    def _prediction(self) -> Prediction | None:
+        return Prediction(self) if self.bench else None
 
 
 def _undone(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -1,0 +1,171 @@
+"""Camera frames that phases predict with all of a fitted bench, and corrections of the phases by what they miss.
+
+The linear road of a calibration turns counts c into ideal frames, whose phase follows from a model without blur,
+pixels that are lit in part, and the relay. Let F(phi) be the counts that the whole model of the bench predicts, and
+I(phi) the ideal frames. A correction solves
+
+    I(phi_next) = I(phi) + B (c - F(phi)),
+
+where B resamples counts to the grid of the pupil. It ends where the frames are explained. B does not invert the
+blur, and a residual that its neighbours' noise explains is left out: so a correction amplifies little noise.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import fft, ndimage
+
+from zwfs._images import nearest_good
+from zwfs._unwrapping import unwrapped
+from zwfs.frames._fitted import FittedSensor, Windows
+from zwfs.frames._grid import Grid, Solved, spline_filter
+from zwfs.frames._optics import Linearised, pooled
+from zwfs.frames._solver import fine_phase
+from zwfs.frames._states import PAD
+
+if TYPE_CHECKING:
+    from zwfs.frames.calibration import Calibration
+
+_N_CORRECTIONS = 2  # the next ones gain little
+_SMOOTHING = 0.5  # pixels rms, of residuals
+_AROUND = 2.0  # pixels rms, of the neighbours whose residuals are compared with their noise
+_FULLY_LIT = 0.9  # share of the light of a pixel
+_EDGE = 2  # pixels around those that are lit in part, whose residuals show the edge and not the phase
+
+
+class Corrected(NamedTuple):
+    """Result of the corrections of k exposures."""
+
+    frames: NDArray[np.float32]  # (k, 2, ny, nx), those of an ideal sensor
+    solved: Solved
+    residual: NDArray[np.float64]  # (k,), rms of counts less their prediction away from edges, 1 = clear frame
+    noise: NDArray[np.float64]  # (k,), that of noise alone
+
+
+class Prediction:
+    """Constants of the model of a fitted bench, in single precision, on the boxes and the grid of a calibration."""
+
+    def __init__(self, calibration: Calibration) -> None:
+        bench, grid = calibration.bench, calibration._work
+        assert bench is not None
+        self._grid, self._bench, model = grid, bench, bench.model
+        self._inside = grid.reconstruct.sensor.pupil.inside
+        self._background, self._unit = (
+            values[:, None, None].astype(np.float32) for values in (calibration.background, calibration.unit)
+        )
+        camera = FittedSensor(bench)._camera.single
+        still = model.light.maps(model.light.start, np.zeros_like(model.light.start))
+        self._flat = Linearised(camera, still, model.values)
+        n, wide = model.n - 2 * PAD, np.eye(model.n)
+        columns = [fine_phase(line[:, None] * np.ones(model.n), camera.f)[:, 0] for line in wide]
+        self._fine = (np.transpose(columns) @ np.pad(np.eye(n), ((PAD, PAD), (0, 0)), "edge")).astype(np.float32)
+        self._continued = nearest_good(np.arange(n * n).reshape(n, n), self._inside)
+        self._steady = np.zeros((2, *camera.shape), np.float32)  # counts of the light that does not interfere
+        self._steady += self._flat.images - self._interfering(np.zeros((n, n), np.float32))
+        self._cuts = _cuts(grid, Windows.of(calibration, bench))
+        self._filters = [spline_filter(length, 0.0) for length in grid.dark.shape[1:]]
+        share = pooled(model.light.start, camera.f) / pooled(model.light.amplitude**2, camera.f)
+        full = self._inside & (share[PAD:-PAD, PAD:-PAD] > _FULLY_LIT)
+        self._inner = ndimage.binary_erosion(full, np.ones((3, 3)), iterations=_EDGE)
+        if not self._inner.any():
+            self._inner = self._inside
+
+    def counts(self, phase: NDArray) -> NDArray[np.float32]:
+        """Counts of the boxes, (2, h, w), less dark and background, of a phase (n, n) without jumps."""
+        images = self._interfering(phase.ravel()[self._continued]) + self._steady
+        return np.stack([image[cut] for image, cut in zip(images, self._cuts, strict=True)]) - self._background
+
+    def corrected(self, raw: NDArray, light: NDArray, lit: NDArray, good: NDArray, solved: Solved) -> Corrected:
+        """Correct phases of counts on the boxes, (k, 2, h, w), with their light, (k,), and good points, (k, ny, nx).
+
+        Those of exposures that are not lit, (k,), stay.
+        """
+        grid, scale = self._grid, light[:, None, None, None].astype(np.float32)
+        variance = np.maximum(raw + self._background, 0) / self._bench.gain + self._bench.noise**2
+        usable = np.stack([~self._under(self._inside & ~points) for points in good]) & lit[:, None, None, None]
+        phase = np.stack([self._unwrapped(single) for single in solved.phase])
+        residual = self._residual(raw, scale, phase, usable)
+        n_iterations = solved.n_iterations
+        for _ in range(_N_CORRECTIONS):
+            missing = _significant(residual, variance, usable) / scale
+            values = grid.resampled(missing.astype(np.float32), self._filters).reshape(len(raw), 2, *good.shape[1:]) / self._unit
+            frames = grid._modelled(solved.phase) + grid.weights[:, 0] * values[:, :1]
+            frames += grid.weights[:, 1] * values[:, 1:]
+            np.maximum(frames, 0, out=frames)
+            solved = grid.solve(frames, good, solved.phase)
+            n_iterations = n_iterations + solved.n_iterations
+            change = solved.phase - phase
+            phase = phase + change - np.float32(2 * np.pi) * np.rint(change / np.float32(2 * np.pi))
+            residual = self._residual(raw, scale, phase, usable)
+        chosen = np.stack([self._under(self._inner & points) for points in good]) & usable & grid.watched
+        chosen &= np.stack([~self._under(self._inside & ~(self._inner & points)) for points in good])
+        number = np.maximum(np.count_nonzero(chosen, axis=(1, 2, 3)), 1)
+        rms = [
+            np.sqrt(np.sum(squares / self._unit**2, axis=(1, 2, 3), where=chosen) / number) / light
+            for squares in (residual**2, variance)
+        ]
+        return Corrected(frames, solved._replace(n_iterations=n_iterations), *rms)
+
+    def _interfering(self, phase: NDArray) -> NDArray[np.float32]:
+        """Counts (2, ny, nx) of the mean field of each point with a phase (n, n), without the background."""
+        flat, camera, optics = self._flat, self._flat.camera, self._flat.optics
+        fine = self._fine @ phase @ self._fine.T
+        field = np.empty(fine.shape, np.complex64)
+        field.real, field.imag = flat.maps.mean * np.cos(fine), flat.maps.mean * np.sin(fine)
+        spectra, inputs = flat._source(field)
+        images = np.empty((2, *camera.shape), np.float32)
+        for group in camera.groups:
+            field = fft.ifft2(optics.transfer[group.arm] * spectra, overwrite_x=True)
+            light = flat._dimple_light(group, inputs, 0)
+            first, second = (numbers[group.mask].item() for numbers in optics.coefficients[:2])
+            intensity = np.abs(field) ** 2 + 2 * (first * field.conj() * light).real + second * np.abs(light) ** 2
+            images[group.images] = flat._on_camera(group.arm, fft.rfft2(flat._cells(intensity)))
+        return images
+
+    def _unwrapped(self, phase: NDArray) -> NDArray[np.float32]:
+        """Phase without jumps of 2 pi, which the fine grid would smooth."""
+        inside = self._inside
+        for axis in (0, 1):
+            steps, both = np.abs(np.diff(phase, axis=axis)), np.moveaxis(inside, axis, 0)
+            if np.any(np.moveaxis(steps, axis, 0)[both[1:] & both[:-1]] > np.pi):
+                return unwrapped(phase.astype(float), inside).astype(np.float32)
+        return phase
+
+    def _residual(self, raw: NDArray, scale: NDArray, phase: NDArray, usable: NDArray) -> NDArray[np.float32]:
+        return np.where(usable, raw - scale * np.stack([self.counts(single) for single in phase]), 0)
+
+    def _under(self, points: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Pixels of the boxes, (2, h, w), from which points (ny, nx) are made."""
+        flat = points.ravel().astype(np.float32)
+        return np.stack([matrix.T @ flat for matrix in self._grid.touching]).reshape(self._grid.dark.shape) > 0
+
+
+def _cuts(grid: Grid, windows: Windows) -> list[tuple[NDArray[np.int64], ...]]:
+    """Pixels of the predicted frames that the boxes cover; beyond the edge they are repeated."""
+    cuts = []
+    for (_, *spans), corner in zip(grid.boxes, windows.corners, strict=True):
+        lines = [np.arange(span.start, span.stop) if isinstance(span, slice) else span for span in spans]
+        places = zip(lines, corner, windows.size, strict=True)
+        cuts.append(np.ix_(*(np.clip(line - first, 0, size - 1) for line, first, size in places)))
+    return cuts
+
+
+def _significant(residual: NDArray, variance: NDArray, usable: NDArray) -> NDArray[np.float64]:
+    """Residuals, (k, 2, h, w), less the share that noise makes up among their neighbours (Wiener's filter)."""
+    smooth = ndimage.gaussian_filter(residual, _SMOOTHING, axes=(2, 3))
+    squares, weight = (
+        ndimage.gaussian_filter(values, _AROUND, axes=(2, 3))
+        for values in (usable * smooth**2 / (_passed() * variance), usable.astype(np.float32))
+    )
+    ratio = squares / np.maximum(weight, 1e-3)
+    return smooth * np.maximum(0, 1 - 1 / np.maximum(ratio, 1e-3))
+
+
+def _passed() -> float:
+    """Share of the variance of white noise that the smoothing passes."""
+    impulse = np.zeros((15, 15))
+    impulse[7, 7] = 1
+    return float(np.sum(ndimage.gaussian_filter(impulse, _SMOOTHING) ** 2))

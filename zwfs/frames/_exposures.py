@@ -25,7 +25,7 @@ _LAMP = (
     0.85,
     1.7,
 )  # light in the pupil, over that of the calibration's frames, that other phases can make of its lamp
-_EXACT = 1e-3  # residual of frames without noise
+_EXACT, _EXACT_OF_BENCH = 1e-3, 2.5e-3  # residuals of frames without noise
 _MOVED_BY, _SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
 _SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
 # Cost of an explanation that is good enough, and factor of the usual residual from which on frames are inconsistent.
@@ -76,7 +76,7 @@ class Exposures:
         self._start, self._method, self._judge = start, method, judge
         self._enough, self._unusual = _ENOUGH if calibration.bench is None else _ENOUGH_OF_BENCH
         self._raw, self.good, self.n_bad, self.n_saturated = self._work.cleaned(counts, level, calibration.good)
-        values = self._work.resampled(self._raw, self._work.filters)
+        values = self._work.resampled(self._raw)
         self.n_good = np.maximum(np.count_nonzero(self.good, axis=(1, 2)), 1)
         sums = np.vecdot(values, self.good.reshape(k, 1, -1).astype(np.float32))
         flux = sums / (self.n_good[:, np.newaxis] * calibration.unit)
@@ -125,7 +125,7 @@ class Exposures:
         solved = work.solve(frames, good, start, None if prediction else self._method)
         if prediction:
             frames, solved, missing, noise = prediction.corrected(self._raw[which], light, self.lit[which], good, solved)
-            usual = np.maximum(noise, max(self._of.residual, _EXACT))
+            usual = np.maximum(noise, max(self._of.residual, _EXACT_OF_BENCH))
             if self._method:
                 solved = work.solve(frames, good, start, self._method)
         if self._judge:

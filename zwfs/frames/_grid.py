@@ -115,7 +115,7 @@ class Grid:
         self.rim = np.flatnonzero(rim)
         self.beyond = ~pupil.inside.ravel()[self.rim]  # points of the rim outside the pupil
         self.edge = _repair(pupil.inside & ~inner, inner)  # points of the edge, and the nearest ones off it
-        self.filters = [spline_filter(length, calibration.blur) for length in size]  # to their coefficients
+        self.filters = [_spline_filter(length, calibration.blur) for length in size]  # to their coefficients
         reached = np.stack([matrix.sum(axis=0) > 0 for matrix in self.touching])
         self.watched = reached.reshape(bad.shape) & ~bad  # good pixels from which the pupil is made
         self.dim = ~reached.reshape(bad.shape) & ~bad  # good pixels around it
@@ -126,11 +126,11 @@ class Grid:
     def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Counts on the grid, (k, 2, n), good points, (k, ny, nx), and bad and saturated pixels, (k,)."""
         raw, good, n_bad, n_saturated = self.cleaned(counts, level, good)
-        return self.resampled(raw, self.filters), good, n_bad, n_saturated
+        return self.resampled(raw), good, n_bad, n_saturated
 
-    def resampled(self, raw: NDArray, filters: Sequence[NDArray]) -> NDArray[np.float32]:
-        """Counts of the boxes, (k, 2, h, w), on the grid, (k, 2, n), by filters to coefficients of their splines."""
-        coefficients = filters[0] @ raw @ filters[1].T
+    def resampled(self, raw: NDArray) -> NDArray[np.float32]:
+        """Counts of the boxes, (k, 2, h, w), on the grid, (k, 2, n)."""
+        coefficients = self.filters[0] @ raw @ self.filters[1].T
         values = np.stack(
             [spline @ coefficients[:, index].reshape(len(raw), -1).T for index, spline in enumerate(self.splines)]
         )
@@ -349,7 +349,7 @@ def _repair(bad: NDArray[np.bool_], good: NDArray[np.bool_]) -> tuple[NDArray, N
     return np.flatnonzero(bad), nearest[bad]
 
 
-def spline_filter(size: int, blur: float) -> NDArray[np.float32]:
+def _spline_filter(size: int, blur: float) -> NDArray[np.float32]:
     """Matrix from samples to coefficients of a cubic spline near the pupil, with Wiener's inverse of a blur."""
     samples = np.pad(np.eye(size), ((_FAR, _FAR), (0, 0)), "edge")
     spread = np.exp(-2 * (np.pi * blur * fft.rfftfreq(len(samples))) ** 2)[:, np.newaxis]

@@ -6,8 +6,8 @@ I(phi) the ideal frames. A correction solves
 
     I(phi_next) = I(phi) + B (c - F(phi)),
 
-where B resamples counts to the grid of the pupil. It ends where the frames are explained. B does not invert the
-blur, and a residual that its neighbours' noise explains is left out: so a correction amplifies little noise.
+where B is the linear road. Its fixed point explains the frames with the whole model. Of a residual, the share that
+noise explains is left out, so that few corrections amplify little of it.
 """
 
 from __future__ import annotations
@@ -19,11 +19,9 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from zwfs._images import nearest_good
-from zwfs._unwrapping import unwrapped
 from zwfs.frames._fitted import FittedSensor, Windows
-from zwfs.frames._grid import Grid, Solved, spline_filter
+from zwfs.frames._grid import Grid, Solved
 from zwfs.frames._optics import Linearised, pooled
-from zwfs.frames._solver import fine_phase
 from zwfs.frames._states import PAD
 
 if TYPE_CHECKING:
@@ -59,14 +57,12 @@ class Prediction:
         camera = FittedSensor(bench)._camera.single
         still = model.light.maps(model.light.start, np.zeros_like(model.light.start))
         self._flat = Linearised(camera, still, model.values)
-        n, wide = model.n - 2 * PAD, np.eye(model.n)
-        columns = [fine_phase(line[:, None] * np.ones(model.n), camera.f)[:, 0] for line in wide]
-        self._fine = (np.transpose(columns) @ np.pad(np.eye(n), ((PAD, PAD), (0, 0)), "edge")).astype(np.float32)
-        self._continued = nearest_good(np.arange(n * n).reshape(n, n), self._inside)
+        lit = np.pad(self._inside, PAD)
+        self._continued = nearest_good(np.pad(np.arange(self._inside.size).reshape(self._inside.shape), PAD), lit)
+        self._pairs = lit[1:] & lit[:-1], lit[:, 1:] & lit[:, :-1]
         self._steady = np.zeros((2, *camera.shape), np.float32)  # counts of the light that does not interfere
-        self._steady += self._flat.images - self._interfering(np.zeros((n, n), np.float32))
+        self._steady += self._flat.images - self._interfering(np.zeros(self._inside.shape, np.float32))
         self._cuts = _cuts(grid, Windows.of(calibration, bench))
-        self._filters = [spline_filter(length, 0.0) for length in grid.dark.shape[1:]]
         share = pooled(model.light.start, camera.f) / pooled(model.light.amplitude**2, camera.f)
         full = self._inside & (share[PAD:-PAD, PAD:-PAD] > _FULLY_LIT)
         self._inner = ndimage.binary_erosion(full, np.ones((3, 3)), iterations=_EDGE)
@@ -74,8 +70,8 @@ class Prediction:
             self._inner = self._inside
 
     def counts(self, phase: NDArray) -> NDArray[np.float32]:
-        """Counts of the boxes, (2, h, w), less dark and background, of a phase (n, n) without jumps."""
-        images = self._interfering(phase.ravel()[self._continued]) + self._steady
+        """Counts of the boxes, (2, h, w), less dark and background, of a phase (n, n)."""
+        images = self._interfering(phase) + self._steady
         return np.stack([image[cut] for image, cut in zip(images, self._cuts, strict=True)]) - self._background
 
     def corrected(self, raw: NDArray, light: NDArray, lit: NDArray, good: NDArray, solved: Solved) -> Corrected:
@@ -86,20 +82,17 @@ class Prediction:
         grid, scale = self._grid, light[:, None, None, None].astype(np.float32)
         variance = np.maximum(raw + self._background, 0) / self._bench.gain + self._bench.noise**2
         usable = np.stack([~self._under(self._inside & ~points) for points in good]) & lit[:, None, None, None]
-        phase = np.stack([self._unwrapped(single) for single in solved.phase])
-        residual = self._residual(raw, scale, phase, usable)
+        residual = self._residual(raw, scale, solved.phase, usable)
         n_iterations = solved.n_iterations
         for _ in range(_N_CORRECTIONS):
             missing = _significant(residual, variance, usable) / scale
-            values = grid.resampled(missing.astype(np.float32), self._filters).reshape(len(raw), 2, *good.shape[1:]) / self._unit
+            values = grid.resampled(missing.astype(np.float32)).reshape(len(raw), 2, *good.shape[1:]) / self._unit
             frames = grid._modelled(solved.phase) + grid.weights[:, 0] * values[:, :1]
             frames += grid.weights[:, 1] * values[:, 1:]
             np.maximum(frames, 0, out=frames)
             solved = grid.solve(frames, good, solved.phase)
             n_iterations = n_iterations + solved.n_iterations
-            change = solved.phase - phase
-            phase = phase + change - np.float32(2 * np.pi) * np.rint(change / np.float32(2 * np.pi))
-            residual = self._residual(raw, scale, phase, usable)
+            residual = self._residual(raw, scale, solved.phase, usable)
         chosen = np.stack([self._under(self._inner & points) for points in good]) & usable & grid.watched
         chosen &= np.stack([~self._under(self._inside & ~(self._inner & points)) for points in good])
         number = np.maximum(np.count_nonzero(chosen, axis=(1, 2, 3)), 1)
@@ -112,7 +105,7 @@ class Prediction:
     def _interfering(self, phase: NDArray) -> NDArray[np.float32]:
         """Counts (2, ny, nx) of the mean field of each point with a phase (n, n), without the background."""
         flat, camera, optics = self._flat, self._flat.camera, self._flat.optics
-        fine = self._fine @ phase @ self._fine.T
+        fine = self._fine(phase)
         field = np.empty(fine.shape, np.complex64)
         field.real, field.imag = flat.maps.mean * np.cos(fine), flat.maps.mean * np.sin(fine)
         spectra, inputs = flat._source(field)
@@ -125,14 +118,15 @@ class Prediction:
             images[group.images] = flat._on_camera(group.arm, fft.rfft2(flat._cells(intensity)))
         return images
 
-    def _unwrapped(self, phase: NDArray) -> NDArray[np.float32]:
-        """Phase without jumps of 2 pi, which the fine grid would smooth."""
-        inside = self._inside
-        for axis in (0, 1):
-            steps, both = np.abs(np.diff(phase, axis=axis)), np.moveaxis(inside, axis, 0)
-            if np.any(np.moveaxis(steps, axis, 0)[both[1:] & both[:-1]] > np.pi):
-                return unwrapped(phase.astype(float), inside).astype(np.float32)
-        return phase
+    def _fine(self, phase: NDArray) -> NDArray[np.float32]:
+        """Phase on the fine grid: a plane in each pixel, as steep as its neighbours are without a jump or a wrap."""
+        wide, f = phase.ravel()[self._continued], self._flat.camera.f
+        places = ((np.arange(f) + 0.5) / f - 0.5).astype(np.float32)
+        fine = wide[:, None, :, None]
+        for axis, pairs in enumerate(self._pairs):
+            slope = _slopes(wide.swapaxes(0, axis), pairs.swapaxes(0, axis)).swapaxes(0, axis)
+            fine = fine + slope[:, None, :, None] * (places[:, None, None] if axis == 0 else places)
+        return fine.reshape(f * len(wide), -1)
 
     def _residual(self, raw: NDArray, scale: NDArray, phase: NDArray, usable: NDArray) -> NDArray[np.float32]:
         return np.where(usable, raw - scale * np.stack([self.counts(single) for single in phase]), 0)
@@ -151,6 +145,20 @@ def _cuts(grid: Grid, windows: Windows) -> list[tuple[NDArray[np.int64], ...]]:
         places = zip(lines, corner, windows.size, strict=True)
         cuts.append(np.ix_(*(np.clip(line - first, 0, size - 1) for line, first, size in places)))
     return cuts
+
+
+def _slopes(phase: NDArray, pairs: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """Slopes along the first axis: the mean of both sides, but at most twice the smaller one; 0 at an extremum.
+
+    Of points whose next one is outside, (ny - 1, nx), the only side counts.
+    """
+    steps = np.diff(phase, axis=0)
+    steps = pairs * (steps - np.float32(2 * np.pi) * np.rint(steps / np.float32(2 * np.pi)))
+    ahead, behind = (np.pad(steps, (side, (0, 0))) for side in ((0, 1), (1, 0)))
+    has_ahead, has_behind = (np.pad(pairs, (side, (0, 0))) for side in ((0, 1), (1, 0)))
+    ahead, behind = np.where(has_ahead, ahead, behind), np.where(has_behind, behind, ahead)
+    least = 2 * np.minimum(np.abs(ahead), np.abs(behind))
+    return np.where(ahead * behind > 0, np.clip((ahead + behind) / 2, -least, least), 0)
 
 
 def _significant(residual: NDArray, variance: NDArray, usable: NDArray) -> NDArray[np.float64]:

@@ -31,7 +31,7 @@ _N_CORRECTIONS = 2  # the next ones gain little
 _SMOOTHING = 0.5  # pixels rms, of residuals
 _AROUND = 2.0  # pixels rms, of the neighbours whose residuals are compared with their noise
 _FULLY_LIT = 0.9  # share of the light of a pixel
-_EDGE = 2  # pixels around those that are lit in part, whose residuals show the edge and not the phase
+_FEWEST = 30  # points without a neighbour that is lit in part: with fewer, edges count, too
 
 
 class Corrected(NamedTuple):
@@ -65,8 +65,8 @@ class Prediction:
         self._cuts = _cuts(grid, Windows.of(calibration, bench))
         share = pooled(model.light.start, camera.f) / pooled(model.light.amplitude**2, camera.f)
         full = self._inside & (share[PAD:-PAD, PAD:-PAD] > _FULLY_LIT)
-        self._inner = ndimage.binary_erosion(full, np.ones((3, 3)), iterations=_EDGE)
-        if not self._inner.any():
+        self._inner = ndimage.binary_erosion(full, np.ones((3, 3)))
+        if np.count_nonzero(self._inner) < _FEWEST:
             self._inner = self._inside
 
     def counts(self, phase: NDArray) -> NDArray[np.float32]:

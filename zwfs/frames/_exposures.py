@@ -74,7 +74,8 @@ class Exposures:
     ) -> None:  # fmt: skip
         self._of, self._work, k = calibration, calibration._work, len(counts)
         self._start, self._method, self._judge = start, method, judge
-        self._enough, self._unusual = _ENOUGH if calibration.bench is None else _ENOUGH_OF_BENCH
+        self._predicted = calibration.bench is not None and method is None  # counts are compared, not ideal frames
+        self._enough, self._unusual = _ENOUGH_OF_BENCH if self._predicted else _ENOUGH
         self._raw, self.good, self.n_bad, self.n_saturated = self._work.cleaned(counts, level, calibration.good)
         values = self._work.resampled(self._raw)
         self.n_good = np.maximum(np.count_nonzero(self.good, axis=(1, 2)), 1)
@@ -121,16 +122,16 @@ class Exposures:
         if self._method is None:
             np.maximum(frames, 0, out=frames)
         start, prediction = None if self._start is None else self._start[which], self._of._prediction
-        usual, residual, ratio = self._usual(light, self.noise[which]), *np.full((2, len(which)), np.nan)
         solved = work.solve(frames, good, start, None if prediction else self._method)
         if prediction:
             frames, solved, missing, noise = prediction.corrected(self._raw[which], light, self.lit[which], good, solved)
-            usual = np.maximum(noise, max(self._of.residual, _EXACT_OF_BENCH))
             if self._method:
                 solved = work.solve(frames, good, start, self._method)
+        usual, residual, ratio = self._usual(light, self.noise[which]), *np.full((2, len(which)), np.nan)
         if self._judge:
             residual, ratio = work.compared(solved.phase, frames, good)
-            residual = missing if prediction else residual
+        if self._judge and self._predicted:
+            residual, usual = missing, np.maximum(noise, max(self._of.residual, _EXACT_OF_BENCH))
         ratio = ratio / self._of.light_ratio
         unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(self.n_good[which]))
         cost = np.where(self.lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)

@@ -12,6 +12,7 @@ import tempfile
 import warnings
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from decimal import Decimal
 from fractions import Fraction
 from functools import cache
@@ -470,6 +471,10 @@ def called(**changes):
     return camera()[-1](np.zeros(camera()[-1].shape), **changes)
 
 
+def with_one_image(**changes):
+    return replace(camera()[-1], optics=pipeline.Optics(1.06, (1.5,)))(np.zeros(camera()[-1].shape), **changes)
+
+
 REFUSED = {
     r"modes: 1 of 6 are linearly independent": lambda: zwfs.MaximumLikelihood(SENSOR, SAME),
     r"modes: 1 of 6 are linearly": lambda: zwfs.cramer_rao(SENSOR, 0 * PUPIL.amplitude, photons=1e4, modes=SAME),
@@ -489,6 +494,9 @@ REFUSED = {
     r"values is a list: expected a Mapping": lambda: BenchFit.replaced(None, []),
     "smooth needs the `bench` of a calibration": lambda: called(smooth=True),
     "light with smooth or noise: expected none": lambda: called(smooth=True, light=1.0),
+    "follow with smooth or noise: expected none": lambda: called(smooth=True, follow=True),
+    "follow = True with judge = False: expected": lambda: called(follow=True, judge=False),
+    "follow = True with one phase shift: expected two": lambda: with_one_image(follow=True),
 }
 
 

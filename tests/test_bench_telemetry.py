@@ -3,6 +3,7 @@
 import io
 import sys
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from zwfs.frames import Calibration, pipeline, reconstruct, registration
 from zwfs.frames.__main__ import main
 from zwfs.frames._calibrate import _read_states, _windows
 from zwfs.frames._fit import fit_bench
+from zwfs.frames.phases import Flag
 
 from .hcipy_bench import HcipyBench
 
@@ -244,3 +246,56 @@ def test_linear_method_measures_small_screens_on_a_fitted_bench(recorded, calibr
     inside = bench.fully_lit & np.isfinite(phase)
     assert rms((phase - truth)[np.newaxis], inside) < 0.3 * rms(truth[np.newaxis], inside)
     assert rms((phase + truth)[np.newaxis], inside) > rms(truth[np.newaxis], inside)  # control: the other sign
+
+
+# Images that have moved
+
+
+class Drifting:
+    """Exposures of a bench with hot pixels, whose images have moved since the calibration."""
+
+    shifts = (0, 0), (0.3, -0.2), (0.6, 0.8), (-1.7, 1.05), (5, 0)
+
+    def __init__(self):
+        bench, rng = HcipyBench(pixels=32, side=48, fine=3, static=0.1), np.random.default_rng(3)
+        hot = rng.random((2, 48, 48)) < 0.003
+        self.screen = bench.smooth(0.4, 1001)
+        flat, clear = (np.where(hot, np.nan, bench.counts(0 * bench.flat, 1, masked)) for masked in (True, False))
+        self.bench, self.calibration = bench, Calibration.from_arrays(flat, clear)
+        benches = [replace(bench, offsets=(shift,) * 2) for shift in self.shifts]
+        self.counts = np.stack([bench.counts(self.screen, 2) for bench in benches])
+        self.counts[:, hot] = 4 * bench.photons
+
+    def errors(self, phases):
+        corner = np.rint(self.calibration.places[0, :, 0, 0]).astype(int)
+        return np.array([np.nanstd(self.bench.difference(phase, corner, self.screen)) for phase in phases])
+
+
+@pytest.fixture(scope="module")
+def drifting():
+    return Drifting()
+
+
+def test_images_that_have_moved_are_followed(drifting):
+    plain, followed = (drifting.calibration(drifting.counts, follow=follow) for follow in (False, True))
+    before, after = drifting.errors(plain.phase), drifting.errors(followed.phase)
+    assert before[2] > 8 * before[0]  # control
+    assert (after[2:4] < 0.25 * before[2:4]).all()
+    assert after[1] < 0.75 * before[1]
+    np.testing.assert_allclose(followed.displacement[:4], drifting.shifts[:4], atol=0.15)
+    assert (followed.flags[[0, 1, 2, 4]] & Flag.MOVED > 0).tolist() == [False, False, False, True]
+    np.testing.assert_array_equal(followed.phase[0], plain.phase[0])
+
+
+def test_telemetry_follows_images_with_equal_bits_and_says_so(drifting, tmp_path):
+    np.save(tmp_path / "cube.npy", drifting.counts)
+    for follow in (False, True):
+        output = tmp_path / f"{follow}.fits"
+        drifting.calibration.save(tmp_path / "bench.npz")
+        options = ["--calibration", str(tmp_path / "bench.npz"), "--saturation", "inf"] + ["--follow"] * follow
+        assert main(["reconstruct", str(tmp_path / "cube.npy"), *options, "-o", str(output)]) == 0
+        expected, table = drifting.calibration(drifting.counts, follow=follow), fits.getdata(output, "FRAMES")
+        np.testing.assert_array_equal(fits.getdata(output), expected.phase)
+        np.testing.assert_array_equal(table["SHIFT"], expected.displacement)
+        np.testing.assert_array_equal(table["FLAGS"], expected.flags)
+        assert fits.getheader(output)["FOLLOW"] is follow

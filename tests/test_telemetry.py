@@ -777,7 +777,7 @@ def test_wrong_argument_is_named(folder, names, settings, error, message):
 RECONSTRUCT = [
     "--modes 5", "--modes 5 --phases", "--photons 1e4", "--photons 1e4 --read-noise 3", "--keywords EXPTIME BUNIT",
     "--saturation 60000", "--largest-residual 0.5", "--wavelength 1650", "--workers 1",
-    "--restart", "--overwrite", "--strict",
+    "--restart", "--overwrite", "--strict", "--follow",
     "--quiet",
 ]  # fmt: skip
 CALIBRATE = [

@@ -25,3 +25,13 @@ def nearest_good(image: NDArray, good: NDArray) -> NDArray:
         return image
     index = ndimage.distance_transform_edt(~good, return_distances=False, return_indices=True)
     return image[(..., *index)]
+
+
+def mean_light(images: NDArray, inside: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean of two clear frames (2, ny, nx), less the background, and the counts that make an intensity of 1.
+
+    Each frame is scaled to a mean of 1 inside. No intensity is below 0.
+    """
+    if np.any((scale := images[:, inside].mean(axis=1)) <= 0):
+        raise ValueError(f"the pupils of the clear frames hold {scale} counts on average: expected light")
+    return np.maximum((images / scale[:, None, None]).mean(axis=0), 0), scale

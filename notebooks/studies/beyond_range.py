@@ -401,14 +401,15 @@ def findings(curves: Sequence[NoiseCurves], many: ErrorCurves, threshold: float)
 
 
 def findings_model(model: Mapping[str, ErrorCurves], noise: NoiseCurves) -> Text:
-    """Return the errors of maximum likelihood that errors of the model cause, largest first."""
+    """Return the largest errors of maximum likelihood that errors of the model cause."""
     rms = next(iter(model.values())).rms
-    lines = ["Median errors of maximum likelihood, largest first:", ""]
+    lines = ["Largest median errors of maximum likelihood:", ""]
     for place in sorted({int(np.argmin(np.abs(rms - 1))), len(rms) - 1}):
         errors = {kind: float(np.median(curve.errors[LIKELY][place])) for kind, curve in model.items()}
-        listed = [f"{small(errors[kind])} rad ({kind})" for kind in sorted(errors, key=lambda kind: -errors[kind])]
-        light = f"{_spaced(noise.photons)} photons per point and image: {small(noise.median(LIKELY)[place])} rad"
-        lines.append(f"- **At {rms[place]:.3g} rad rms:** {', '.join(listed)}. Noise of {light}.")
+        largest = sorted(errors, key=lambda kind: -errors[kind])[:2]
+        listed = ", ".join(f"{small(errors[kind])} rad ({kind})" for kind in largest)
+        light = f"{small(noise.median(LIKELY)[place])} rad (noise of {_spaced(noise.photons)} photons)"
+        lines.append(f"- **At {rms[place]:.3g} rad rms:** {listed}; for comparison, {light}.")
     return Text("\n".join(lines))
 
 

@@ -336,16 +336,17 @@ def findings_rise(curve: DiameterCurves, n_iterations: int) -> Text:
 
 
 def findings_methods(curves: Mapping[str, DiameterCurves], threshold: float) -> Text:
-    """Return the diameters at which the error of each method rises."""
-    rises = [
-        f"- **{LOOKS[name].name}:** " + _above(_rise(curve, name, threshold * curve.rms[0]), curve.diameters[-1])
-        for name, curve in curves.items()
-    ]
-    rule = (
-        f"The mean error exceeds {percent(threshold)} of the input, or twice the error at "
-        f"{_usual(curves[ITERATION]):.3g} λ/D if that is larger:"
+    """Return the methods whose error rises at the smallest and the largest diameter."""
+    rises = {name: _rise(curve, name, threshold * curve.rms[0]) for name, curve in curves.items()}
+    names = sorted(rises, key=rises.__getitem__)
+    first, last = (
+        f"{LOOKS[name].name} ({_above(rises[name], curves[name].diameters[-1])})"
+        for name in names[:: len(names) - 1]
     )
-    return Text("\n".join([rule, "", *rises]))
+    return Text(
+        f"The mean error exceeds {percent(threshold)} of the input, or twice the error at "
+        f"{_usual(curves[ITERATION]):.3g} λ/D if that is larger, first with {first}, and last with {last}."
+    )
 
 
 def numbers(

@@ -263,7 +263,7 @@ def findings_wide(curves: Mapping[float, PhotonCurves]) -> Text:
         sentences.append(
             f"- **Dimples of {diameter:g} λ/D**, at {case.rms[row]:g} rad rms and {case.photons[column]:g} "
             f"photons: the median error is {likely} times the bound with maximum likelihood and {shifted} times "
-            f"with the iteration, whose worst screen has {worst:.3g} times the bound."
+            f"with the iteration (worst screen: {worst:.3g})."
         )
     return Text("\n".join(sentences))
 

@@ -10,7 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy import fft
 
 from studies.kit import sweeps
@@ -406,17 +406,12 @@ def findings(curves: SensorCurves) -> Text:
     best, best_high = (min(higher, key=lambda name: higher[name][end]) for end in (0, -1))
     tilt = {name: _tip_tilt(cost)[0] for name, cost in curves.costs.items()}
     best_tilt = min(tilt, key=lambda name: tilt[name])
-    sharp = curves.inputs[higher[PYRAMID] < higher[pairs[-1]]]
     first, last = pairs[0], pairs[-1]
-    where = "at every input"
-    if 0 < len(sharp) < len(curves.inputs):
-        where = f"only at {_listed(sharp)} rad rms"
-    rival = f"The {PYRAMID} needs {'fewer' if len(sharp) else 'more'} photons than the {last} {where}."
     return Text(
         f"**Of these sensors, the {best} needs the fewest photons {_place(low)}: {_times(higher[best][0])} times "
         f"those of an ideal sensor. {_place(high).capitalize()} the {best_high} needs the fewest, "
         f"{_times(higher[best_high][-1])} times.** The {first} needs {_times(higher[first][0])} times as many as "
-        f"an ideal sensor {_place(low)}, and {_times(higher[first][-1])} times {_place(high)}. {rival} These "
+        f"an ideal sensor {_place(low)}, and {_times(higher[first][-1])} times {_place(high)}. These "
         "numbers are bounds for photon noise alone, and means over the higher modes, all but tip and tilt. For "
         f"tip and tilt {_place(low)}, the {best_tilt} needs the fewest photons, {_times(tilt[best_tilt])} times "
         f"those of an ideal sensor, and the {last} needs {_times(tilt[last])} times."
@@ -444,12 +439,6 @@ def fit_findings(curves: SensorCurves) -> Text:
 def _pairs(curves: SensorCurves) -> list[str]:
     """Names of the pairs, that of the paper first."""
     return [sensor.name for sensor in curves.sensors if sensor.family == "pair"]
-
-
-def _listed(values: ArrayLike) -> str:
-    """Return numbers as an enumeration."""
-    *front, last = (f"{value:g}" for value in np.asarray(values))
-    return f"{', '.join(front)} and {last}" if front else last
 
 
 def _up_to(reach: float, largest: float) -> str:

@@ -18,10 +18,9 @@ from scipy import ndimage
 
 from zwfs import _check
 from zwfs._arrays import Immutable
-from zwfs._images import radius
+from zwfs._images import mean_light, radius
 from zwfs.bench.relay import Relay
 from zwfs.detector import Detector
-from zwfs.frames.pipeline import mean_light
 from zwfs.masks import Dimple
 from zwfs.metrics import without_piston
 from zwfs.modes import power_law_screens, zernike_basis

@@ -99,6 +99,7 @@ def _add_reconstruct(parser: argparse.ArgumentParser) -> None:
     add("--keywords", nargs="+", default=(), metavar="KEY", help="of the headers, for the table")
     add("--saturation", type=float, metavar="COUNTS", help="default: that of the calibration")
     add("--largest-residual", type=float, metavar="RMS", help="of a consistent frame")
+    add("--follow", action="store_true", help="move images back that have moved since the calibration")
     add("--workers", dest="n_workers", type=int, metavar="N", help="default: one for each core")
     add("--restart", action="store_true", help="drop the part of an interrupted run")
     add("--overwrite", action="store_true", help="replace any file")

@@ -17,6 +17,8 @@ from zwfs.frames.pipeline import MOST_BAD
 from zwfs.reconstructors.base import Reconstructor
 
 if TYPE_CHECKING:
+    from zwfs.frames._grid import Grid
+    from zwfs.frames._prediction import Prediction
     from zwfs.frames.calibration import Calibration
 
 _DIM = 0.1  # of the light of the calibration: a frame with less is compared with its noise
@@ -26,7 +28,7 @@ _LAMP = (
     1.7,
 )  # light in the pupil, over that of the calibration's frames, that other phases can make of its lamp
 _EXACT, _EXACT_OF_BENCH = 1e-3, 2.5e-3  # residuals of frames without noise
-_MOVED_BY, _SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
+MOVED_BY, SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
 _SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
 # Cost of an explanation that is good enough, and factor of the usual residual from which on frames are inconsistent.
 _ENOUGH = 2.25, 2.5
@@ -34,7 +36,7 @@ _ENOUGH_OF_BENCH = 1.56, 1.25  # where the noise is known
 _PASSES = 4  # in which the light of the modelled frames gives the next light
 _STEPS = 0.08, 0.08, 0.04, 0.02, 0.01  # relative changes of the light
 _BETTER = 0.8  # of the cost: a smaller gain moves no light
-_LOST, _BAD, _SATURATED, _INCONSISTENT, _NOT_CONVERGED, _MOVED = (
+_LOST, _BAD, _SATURATED, INCONSISTENT, _NOT_CONVERGED, MOVED = (
     flag.value for flag in Flag
 )  # plain, and far quicker
 
@@ -70,13 +72,15 @@ class Exposures:
 
     def __init__(
         self, calibration: Calibration, counts: NDArray, level: float, start: NDArray | None,
-        method: Reconstructor | None, judge: bool,
+        method: Reconstructor | None, judge: bool, work: Grid | None = None, prediction: Prediction | None = None,
     ) -> None:  # fmt: skip
-        self._of, self._work, k = calibration, calibration._work, len(counts)
+        self._of, self._work, k = calibration, work or calibration._work, len(counts)
+        self._counts, self._level = counts, level
         self._start, self._method, self._judge = start, method, judge
-        self._predicted = calibration.bench is not None and method is None  # counts are compared, not ideal frames
+        self._prediction = prediction if work else calibration._prediction
+        self._predicted = self._prediction is not None and method is None  # counts are compared, not ideal frames
         self._enough, self._unusual = _ENOUGH_OF_BENCH if self._predicted else _ENOUGH
-        self._raw, self.good, self.n_bad, self.n_saturated = self._work.cleaned(counts, level, calibration.good)
+        self._raw, self.good, self.n_bad, self.n_saturated = self._work.cleaned(counts, level, self._work.good)
         values = self._work.resampled(self._raw)
         self.n_good = np.maximum(np.count_nonzero(self.good, axis=(1, 2)), 1)
         sums = np.vecdot(values, self.good.reshape(k, 1, -1).astype(np.float32))
@@ -91,6 +95,24 @@ class Exposures:
         values = values.reshape(k, *calibration.offset.shape)
         self._ideal = self._work.weights[:, 0] * values[:, :1] + self._work.weights[:, 1] * values[:, 1:]
 
+    def moved(self, index: int, shift: NDArray, start: NDArray | None = None) -> Exposures:
+        """One exposure whose images have moved by rows and columns; a start replaces its own."""
+        which = slice(index, index + 1)
+        if self._start is not None and start is None:
+            start = self._start[which]
+        if self._method is not None and not self._method.iterative:
+            start = None
+        work = self._of._work.moved(self._of, shift)
+        prediction = self._of._prediction and self._of._prediction.moved(work, shift)
+        counts = self._counts[which]
+        return Exposures(self._of, counts, self._level, start, self._method, True, work, prediction)
+
+    def residuals(self, light: NDArray) -> NDArray[np.float64]:
+        """Modelled less measured frames of one exposure in the pupil, with a light; NaN at bad points."""
+        trial, inside = self._attempt(np.arange(1), light), self._of.sensor.pupil.inside
+        missing = np.where(self.good[:, np.newaxis], self._work.modelled(trial.phase) - trial.frames, np.nan)
+        return missing[0][:, inside].ravel().astype(float)
+
     def phases(self, light: NDArray | None, limit: float | None) -> Phases:
         """Phases with a known light, (k,), or that which explains the frames."""
         same = (self.relative > _LAMP[0]) & (self.relative < _LAMP[1]) | ~self.lit
@@ -99,7 +121,7 @@ class Exposures:
             self._explain(trial)
         residual, displacement, moved = self._compared(trial)
         limits = self._unusual * trial.usual if limit is None else limit
-        flags = _BAD * (self.n_bad > 0) + _SATURATED * (self.n_saturated > 0) + _INCONSISTENT * (residual > limits)
+        flags = _BAD * (self.n_bad > 0) + _SATURATED * (self.n_saturated > 0) + INCONSISTENT * (residual > limits)
         flags += np.where(self.lit, _NOT_CONVERGED * (~trial.converged & (self._of.tolerance > 0)), _LOST)
         return Phases(
             phase=np.where(self.good & self.lit[:, np.newaxis, np.newaxis], trial.phase, np.float32(np.nan)),
@@ -111,7 +133,7 @@ class Exposures:
             displacement=displacement,
             n_iterations=trial.n_iterations,
             n_unsolved=trial.n_unsolved,
-            flags=flags + _MOVED * moved,
+            flags=flags + MOVED * moved,
         )
 
     def _attempt(self, which: NDArray[np.intp], light: NDArray[np.float64]) -> Trial:
@@ -121,12 +143,13 @@ class Exposures:
         frames[~self.lit[which]] = work.flat_frames  # of a flat wavefront: they converge at once
         if self._method is None:
             np.maximum(frames, 0, out=frames)
-        start, prediction = None if self._start is None else self._start[which], self._of._prediction
+        start, prediction = None if self._start is None else self._start[which], self._prediction
         solved = work.solve(frames, good, start, None if prediction else self._method)
         if prediction:
-            frames, solved, missing, noise = prediction.corrected(self._raw[which], light, self.lit[which], good, solved)
+            lit = self.lit[which]
+            frames, quiet, solved, missing, noise = prediction.corrected(self._raw[which], light, lit, good, solved)
             if self._method:
-                solved = work.solve(frames, good, start, self._method)
+                solved = work.solve(quiet, good, start, self._method)
         usual, residual, ratio = self._usual(light, self.noise[which]), *np.full((2, len(which)), np.nan)
         if self._judge:
             residual, ratio = work.compared(solved.phase, frames, good)
@@ -164,7 +187,7 @@ class Exposures:
             shift, sigma[lit] = self._work.displaced(trial.phase[lit], trial.frames[lit], self.good[lit])
             displacement[lit] = shift - (usual.mean(axis=0) if len(usual) else 0)
         scatter = usual.std(axis=0) if len(usual) else 0
-        moved = np.abs(displacement) > np.maximum(_MOVED_BY, _SURE * np.hypot(sigma, scatter))
+        moved = np.abs(displacement) > np.maximum(MOVED_BY, SURE * np.hypot(sigma, scatter))
         return residual, displacement, np.any(moved, axis=1)
 
     def _dark_noise(self, counts: NDArray, flux: NDArray) -> NDArray[np.float64]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
+from functools import lru_cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -92,7 +94,31 @@ class Grid:
         self.weights, self.offset = calibration.weights.astype(np.float32), calibration.offset.astype(np.float32)
         flat = sensor.measure(np.zeros(pupil.shape)).astype(np.float32)
         self.flat_frames = np.broadcast_to(flat, (2, *pupil.shape))
-        places = calibration.places.reshape(2, 2, -1)
+        near = ndimage.binary_dilation(pupil.inside, iterations=_RIM)
+        inner = ndimage.binary_erosion(pupil.inside)
+        self._near, rim = near.ravel().astype(float), near & ~inner
+        rim[[0, -1]] = rim[:, [0, -1]] = False  # a slope needs neighbours
+        self.rim = np.flatnonzero(rim)
+        self.beyond = ~pupil.inside.ravel()[self.rim]  # points of the rim outside the pupil
+        self.edge = _repair(pupil.inside & ~inner, inner)  # points of the edge, and the nearest ones off it
+        self._place(calibration, calibration.places)
+        self._ignore(calibration.good)
+
+    def moved(self, calibration: Calibration, shift: NDArray) -> Grid:
+        """Grid of images that have moved on the camera by some rows and columns, both by the same ones.
+
+        Dark and bad pixels stay where they are, and points that move onto bad pixels or off the camera are bad.
+        """
+        grid, places = copy(self), calibration.places + shift[:, np.newaxis, np.newaxis]
+        grid._place(calibration, places)
+        last = np.reshape(calibration.shape, (2, 1, 1)) - 1
+        off = np.any((places < -0.5) | (places > last + 0.5), axis=(0, 1))
+        grid._ignore(calibration.good & ~off & ~grid.touched(grid.bad[np.newaxis])[0])
+        return grid
+
+    def _place(self, calibration: Calibration, points: NDArray) -> None:
+        """Set the boxes of the camera, and the way from them to points of the pupil, (2, 2, ny, nx)."""
+        places = points.reshape(2, 2, -1)
         low = np.floor(places.min(axis=2)).astype(int) - _REACH
         size = (np.floor(places.max(axis=2)).astype(int) + _REACH + 2 - low).max(axis=0)
         self.boxes: list[tuple[int, Any, Any]] = []  # image, rows and columns
@@ -102,26 +128,22 @@ class Grid:
         pairs = calibration.dark, calibration.bad
         dark, bad = (np.stack([maps[i][rows][:, columns] for i, rows, columns in self.boxes]) for maps in pairs)
         self.dark, self.bad = dark + calibration.background[:, np.newaxis, np.newaxis].astype(np.float32), bad
-        corners, inside = places - low[:, :, np.newaxis], pupil.inside.ravel().astype(float)
+        corners = places - low[:, :, np.newaxis]
+        inside = self.reconstruct.sensor.pupil.inside.ravel().astype(float)
         self.touching = [_interpolation(place, size, 1, inside) for place in corners]  # from all pixels of a box
-        self._corners = corners.reshape(calibration.places.shape)
-        near = ndimage.binary_dilation(pupil.inside, iterations=_RIM)
-        self.splines = [
-            _interpolation(place - _CUT, size - 2 * _CUT, 3, near.ravel().astype(float)) for place in corners
-        ]
-        inner = ndimage.binary_erosion(pupil.inside)
-        rim = near & ~inner
-        rim[[0, -1]] = rim[:, [0, -1]] = False  # a slope needs neighbours
-        self.rim = np.flatnonzero(rim)
-        self.beyond = ~pupil.inside.ravel()[self.rim]  # points of the rim outside the pupil
-        self.edge = _repair(pupil.inside & ~inner, inner)  # points of the edge, and the nearest ones off it
+        self._corners = corners.reshape(points.shape)
+        self.splines = [_interpolation(place - _CUT, size - 2 * _CUT, 3, self._near) for place in corners]
         self.filters = [_spline_filter(length, calibration.blur) for length in size]  # to their coefficients
         reached = np.stack([matrix.sum(axis=0) > 0 for matrix in self.touching])
         self.watched = reached.reshape(bad.shape) & ~bad  # good pixels from which the pupil is made
         self.dim = ~reached.reshape(bad.shape) & ~bad  # good pixels around it
-        # Bad pixels of each box, and bad points of the pupil, with their nearest good ones.
+        # Bad pixels of each box with their nearest good ones.
         self.repairs = [_repair(pixels, ~pixels) for pixels in bad]
-        self.holes = _repair(pupil.inside & ~calibration.good, calibration.good)
+
+    def _ignore(self, good: NDArray[np.bool_]) -> None:
+        """Set the good points, and bad ones of the pupil with their nearest good ones."""
+        self.good = good
+        self.holes = _repair(self.reconstruct.sensor.pupil.inside & ~good, good)
 
     def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Counts on the grid, (k, 2, n), good points, (k, ny, nx), and bad and saturated pixels, (k,)."""
@@ -189,7 +211,7 @@ class Grid:
 
     def compared(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
         """Rms difference of frames (k, 2, ny, nx) from those of phases, (k,), and the ratio of their light."""
-        modelled, pupil = self._modelled(phase), self.reconstruct.sensor.pupil
+        modelled, pupil = self.modelled(phase), self.reconstruct.sensor.pupil
         squares = np.sum((modelled - frames) ** 2, axis=(1, 2, 3), where=pupil.inside)
         where = good[:, np.newaxis]
         light, expected = (np.sum(pair - self.offset, axis=(1, 2, 3), where=where) for pair in (frames, modelled))
@@ -207,7 +229,7 @@ class Grid:
         steady = phase.reshape(k, -1).copy()
         steady[:, self.edge[0]] = steady[:, self.edge[1]]
         modelled, measured = (
-            pair.sum(axis=1).reshape(k, -1) for pair in (self._modelled(steady.reshape(phase.shape)), frames)
+            pair.sum(axis=1).reshape(k, -1) for pair in (self.modelled(steady.reshape(phase.shape)), frames)
         )
         weight = good.reshape(k, -1)[:, self.rim] | self.beyond
         around = ((self.rim + step, self.rim - step) for step in (width, 1))
@@ -220,7 +242,7 @@ class Grid:
         variance = np.vecdot(missing, missing) / np.maximum(weight.sum(axis=1) - 2, 1)
         return shift, np.sqrt(variance[:, np.newaxis] * inverse[:, (0, 1), (0, 1)])
 
-    def _modelled(self, phase: NDArray) -> NDArray:
+    def modelled(self, phase: NDArray) -> NDArray:
         """Frames of phases on the grid of the pupil, (k, 2, ny, nx)."""
         model = self.reconstruct.settings.model(Kind.of(phase))
         psi = model.incoming(phase)
@@ -349,6 +371,7 @@ def _repair(bad: NDArray[np.bool_], good: NDArray[np.bool_]) -> tuple[NDArray, N
     return np.flatnonzero(bad), nearest[bad]
 
 
+@lru_cache(maxsize=16)
 def _spline_filter(size: int, blur: float) -> NDArray[np.float32]:
     """Matrix from samples to coefficients of a cubic spline near the pupil, with Wiener's inverse of a blur."""
     samples = np.pad(np.eye(size), ((_FAR, _FAR), (0, 0)), "edge")

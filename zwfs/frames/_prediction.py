@@ -12,6 +12,7 @@ noise explains is left out, so that few corrections amplify little of it.
 
 from __future__ import annotations
 
+from copy import copy
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -19,9 +20,10 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage
 
 from zwfs._images import nearest_good
+from zwfs.frames._fit import BenchFit
 from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames._grid import Grid, Solved
-from zwfs.frames._optics import Linearised, pooled
+from zwfs.frames._optics import Linearised, _Spline, pooled
 from zwfs.frames._states import PAD
 
 if TYPE_CHECKING:
@@ -37,7 +39,8 @@ _FEWEST = 30  # points without a neighbour that is lit in part: with fewer, edge
 class Corrected(NamedTuple):
     """Result of the corrections of k exposures."""
 
-    frames: NDArray[np.float32]  # (k, 2, ny, nx), those of an ideal sensor
+    frames: NDArray[np.float32]  # (k, 2, ny, nx), those of an ideal sensor with all that their phases miss
+    quiet: NDArray[np.float32]  # the same without what noise explains
     solved: Solved
     residual: NDArray[np.float64]  # (k,), rms of counts less their prediction away from edges, 1 = clear frame
     noise: NDArray[np.float64]  # (k,), that of noise alone
@@ -46,10 +49,9 @@ class Corrected(NamedTuple):
 class Prediction:
     """Constants of the model of a fitted bench, in single precision, on the boxes and the grid of a calibration."""
 
-    def __init__(self, calibration: Calibration) -> None:
-        bench, grid = calibration.bench, calibration._work
-        assert bench is not None
-        self._grid, self._bench, model = grid, bench, bench.model
+    def __init__(self, calibration: Calibration, bench: BenchFit) -> None:
+        grid, model = calibration._work, bench.model
+        self._bench, self._windows = bench, Windows.of(calibration, bench)
         self._inside = grid.reconstruct.sensor.pupil.inside
         self._background, self._unit = (
             values[:, None, None].astype(np.float32) for values in (calibration.background, calibration.unit)
@@ -60,14 +62,33 @@ class Prediction:
         lit = np.pad(self._inside, PAD)
         self._continued = nearest_good(np.pad(np.arange(self._inside.size).reshape(self._inside.shape), PAD), lit)
         self._pairs = lit[1:] & lit[:-1], lit[:, 1:] & lit[:, :-1]
-        self._steady = np.zeros((2, *camera.shape), np.float32)  # counts of the light that does not interfere
-        self._steady += self._flat.images - self._interfering(np.zeros(self._inside.shape, np.float32))
-        self._cuts = _cuts(grid, Windows.of(calibration, bench))
         share = pooled(model.light.start, camera.f) / pooled(model.light.amplitude**2, camera.f)
         full = self._inside & (share[PAD:-PAD, PAD:-PAD] > _FULLY_LIT)
         self._inner = ndimage.binary_erosion(full, np.ones((3, 3)))
         if np.count_nonzero(self._inner) < _FEWEST:
             self._inner = self._inside
+        self._place(grid)
+
+    def moved(self, grid: Grid, shift: NDArray) -> Prediction:
+        """Prediction of images that have moved on the camera by rows and columns, for a grid that follows them."""
+        out, flat = copy(self), copy(self._flat)
+        out._flat, flat.optics = flat, copy(flat.optics)
+        flat.optics.splines = {}
+        for number, arm in enumerate(self._bench.model.arms):
+            place = arm["row"] + shift[0], arm["column"] + shift[1], arm["rotation"], arm["magnification"]
+            flat.optics.splines[number] = _Spline(flat.camera, place).single
+        out._place(grid)
+        return out
+
+    def _place(self, grid: Grid) -> None:
+        """Set the grid, and the way from predicted frames to its boxes."""
+        flat, self._grid = self._flat, grid
+        # The light that does not interfere, counts.
+        self._steady = np.stack([
+            flat._on_camera(arm, flat.optics.spread[arm][0] * flat._rest) + flat.arms[arm]["background"]
+            for arm in (0, 1)
+        ])  # fmt: skip
+        self._cuts = _cuts(grid, self._windows)
 
     def counts(self, phase: NDArray) -> NDArray[np.float32]:
         """Counts of the boxes, (2, h, w), less dark and background, of a phase (n, n)."""
@@ -85,12 +106,8 @@ class Prediction:
         residual = self._residual(raw, scale, solved.phase, usable)
         n_iterations = solved.n_iterations
         for _ in range(_N_CORRECTIONS):
-            missing = _significant(residual, variance, usable) / scale
-            values = grid.resampled(missing.astype(np.float32)).reshape(len(raw), 2, *good.shape[1:]) / self._unit
-            frames = grid._modelled(solved.phase) + grid.weights[:, 0] * values[:, :1]
-            frames += grid.weights[:, 1] * values[:, 1:]
-            np.maximum(frames, 0, out=frames)
-            solved = grid.solve(frames, good, solved.phase)
+            frames = self._ideal(solved.phase, _significant(residual, variance, usable) / scale)
+            solved = grid.solve(np.maximum(frames, 0), good, solved.phase)
             n_iterations = n_iterations + solved.n_iterations
             residual = self._residual(raw, scale, solved.phase, usable)
         chosen = np.stack([self._under(self._inner & points) for points in good]) & usable & grid.watched
@@ -100,7 +117,15 @@ class Prediction:
             np.sqrt(np.sum(squares / self._unit**2, axis=(1, 2, 3), where=chosen) / number) / light
             for squares in (residual**2, variance)
         ]
-        return Corrected(frames, solved._replace(n_iterations=n_iterations), *rms)
+        parts = residual, _significant(residual, variance, usable)
+        frames, quiet = (self._ideal(solved.phase, missing / scale) for missing in parts)
+        return Corrected(frames, quiet, solved._replace(n_iterations=n_iterations), *rms)
+
+    def _ideal(self, phase: NDArray, missing: NDArray) -> NDArray[np.float32]:
+        """Frames of an ideal sensor, (k, 2, ny, nx): those of phases, and counts of the boxes that they miss."""
+        grid, modelled = self._grid, self._grid.modelled(phase)
+        values = grid.resampled(missing.astype(np.float32)).reshape(modelled.shape) / self._unit
+        return modelled + grid.weights[:, 0] * values[:, :1] + grid.weights[:, 1] * values[:, 1:]
 
     def _interfering(self, phase: NDArray) -> NDArray[np.float32]:
         """Counts (2, ny, nx) of the mean field of each point with a phase (n, n), without the background."""

@@ -390,7 +390,7 @@ class PhaseController:
         """Mean light in the pupil of modelled frames of the last phase, from which the next frame starts."""
         if self._tracking:
             return self._tracking.start(self.phase) - self._stray
-        frames = self._work._modelled(self.phase[np.newaxis])[0]
+        frames = self._work.modelled(self.phase[np.newaxis])[0]
         return float(np.mean(frames.reshape(2, -1) @ self._mean)) - self._stray
 
     def _frames(self, counts: NDArray, brightness: float) -> tuple[NDArray[np.float32], float, int]:

@@ -34,6 +34,7 @@ class Flag(IntFlag):
         The iteration used all its steps.
     MOVED
         The images have moved on the camera since the calibration, by more than 0.1 pixel and 5 standard errors.
+        With `follow`: such a displacement remains.
 
     Examples
     --------
@@ -71,7 +72,8 @@ class Phases(PhaseResult):
         of counts and their prediction, away from edges. NaN if the frame is lost, or was not judged.
     displacement : ndarray of float32, shape (..., 2), pixels
         Rows and columns by which the pupil has moved since the calibration, from its rim on both images. It comes
-        out at 0.5 to 1.2 times the true value. NaN if the frame is lost, or was not judged.
+        out at 0.5 to 1.2 times the true value. With `follow` it holds the shift that was undone and what remains,
+        to 0.15 pixel. NaN if the frame is lost, or was not judged.
     n_iterations, n_unsolved, flags : ndarray of int, shape (...)
         Iterations, points whose equations had no unique solution, and the sum of `Flag`; 0 is a good frame.
     sigma : ndarray, shape (..., ny, nx), radian, or None

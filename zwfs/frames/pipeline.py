@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from zwfs import _check
-from zwfs._images import nearest_good, radius
+from zwfs._images import mean_light, nearest_good, radius
 from zwfs.frames._grid import iterated
 from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Image, RegisteredFrames, correlations, register_frames
 from zwfs.masks import Dimple, Mask
@@ -483,16 +483,6 @@ def _gains(images: NDArray, inside: NDArray, center: tuple[float, float], diamet
     coefficients[0] = 0  # the scale of each image is measured apart
     half = terms @ np.linalg.solve(triangle, coefficients) / 2
     return np.exp([-half, half])
-
-
-def mean_light(images: NDArray, inside: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean of two clear frames (2, ny, nx), less the background, and the counts that make an intensity of 1.
-
-    Each frame is scaled to a mean of 1 inside. No intensity is below 0.
-    """
-    if np.any((scale := images[:, inside].mean(axis=1)) <= 0):
-        raise ValueError(f"the pupils of the clear frames hold {scale} counts on average: expected light")
-    return np.maximum((images / scale[:, None, None]).mean(axis=0), 0), scale
 
 
 def _fully_lit(amplitude: NDArray, diameter: float, least: float, apart: int) -> NDArray[np.bool_]:

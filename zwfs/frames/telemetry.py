@@ -23,6 +23,7 @@ from zwfs import _check
 from zwfs._system import one_thread, path_of, paths_of
 from zwfs.frames._blocks import FileError
 from zwfs.frames._fits import card_value, fits_module
+from zwfs.frames._follow import checked_follow
 from zwfs.frames._part import Cards, Part, Unit
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
@@ -77,7 +78,7 @@ def reconstruct(
     phases: bool | None = None, photons: float | None = None, read_noise: float = 0.0,
     wavelength: float | None = None, keywords: Sequence[str] = (), saturation: float | None = None,
     largest_residual: float | None = None, n_workers: int | None = None, restart: bool = False,
-    overwrite: bool = False, progress: Callable[[int, int], Any] | None = None,
+    overwrite: bool = False, progress: Callable[[int, int], Any] | None = None, follow: bool = False,
 ) -> Summary:  # fmt: skip
     """Reconstruct all frames of camera files, and write phases or coefficients with a table as FITS.
 
@@ -121,6 +122,8 @@ def reconstruct(
         Whether `output` may be any file but an input or the calibration.
     progress : callable, optional
         Called with the number of frames that are done, and of all frames.
+    follow : bool
+        Whether images that have moved since the calibration are moved back, see `Calibration.__call__`.
 
     Raises
     ------
@@ -163,7 +166,7 @@ def reconstruct(
     stack = Stack(files, second_files, calibration.n_images, calibration.shape)
     if largest_residual is not None:
         largest_residual = _check.number_or_inf("largest_residual", largest_residual)
-    settings = modes, phases, photons, read_noise, wavelength, keywords, saturation, largest_residual
+    settings = modes, phases, photons, read_noise, wavelength, keywords, saturation, largest_residual, follow
     job = _Job(stack, calibration, *settings)
     report = _check.callback("progress", progress)
     pieces = _spans(stack.n, job.chunk)
@@ -190,10 +193,10 @@ class _Job:
 
     def __init__(
         self, stack: Stack, calibration: Calibration, modes: Any, phases: Any, photons: Any, read_noise: Any,
-        wavelength: Any, keywords: Any, saturation: Any, largest_residual: float | None,
+        wavelength: Any, keywords: Any, saturation: Any, largest_residual: float | None, follow: bool,
     ) -> None:  # fmt: skip
         self.stack, self.calibration, pupil = stack, calibration, calibration.sensor.pupil
-        self.largest_residual = largest_residual
+        self.largest_residual, self.follow = largest_residual, checked_follow(follow, calibration)
         for block in stack.firsts:
             unit, own = str(block.header.get("BUNIT", "")).strip(), calibration.bunit.strip()
             if own and unit and unit.lower() != own.lower():
@@ -270,6 +273,7 @@ class _Job:
             ("SATURATE", self.saturation, "[count] pixels that reach it are saturated"),
             ("MAXITER", calibration.n_iterations, "largest number of iterations"),
             ("TOLERANC", calibration.tolerance, "[rad] change that ends the iteration"),
+            ("FOLLOW", self.follow, "whether images that have moved are moved back"),
         ]
         if wavelength is not None:
             cards += [
@@ -290,7 +294,7 @@ class _Job:
 
     def plan(self) -> str:
         """All that decides the bytes of the output."""
-        settings = [self.photons, self.read_noise, self.saturation, self.largest_residual, self.chunk]
+        settings = [self.photons, self.read_noise, self.saturation, self.largest_residual, self.follow, self.chunk]
         modes = None if self.modes is None else zlib.crc32(np.ascontiguousarray(self.modes).tobytes())
         headers = [unit.header().hex() for unit in self.units]
         state = self.stack.state(), self.calibration.sha256, settings, modes, headers
@@ -324,7 +328,8 @@ class _Job:
     def _reconstruct(self, part: Part, chunk: tuple[int, int]) -> tuple[int, int]:
         counts = self.stack.read(*chunk)
         limits: dict[str, Any] = {"saturation": self.saturation, "largest_residual": self.largest_residual}
-        phases = self.calibration(counts[:, 0] if counts.shape[1] == 1 else counts, **limits)
+        images = counts[:, 0] if counts.shape[1] == 1 else counts
+        phases = self.calibration(images, follow=self.follow, **limits)
         values = {"": phases.phase}
         if self.has_sigma:
             values["SIGMA"] = self.calibration.sigma(phases, self.photons, self.read_noise)

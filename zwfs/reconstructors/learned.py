@@ -345,7 +345,8 @@ class LearnedReference(Reconstructor):
         inputs = _inputs(window.reshape(*window.shape[:2], -1), self._constants(Kind.of(checked)))
         outputs = training.network(training.network.scaled(inputs))
         values = _unbiased(training, _values(outputs, training, self._ranges))
-        spread = np.maximum(values.std(axis=0), training.scatter) / math.sqrt(len(values))
+        scatter = values.std(axis=0, ddof=min(1, len(values) - 1))
+        spread = np.maximum(scatter, training.scatter) / math.sqrt(len(values))
         errors = np.where(self._free, np.hypot(spread, training.bias), 0)
         return BenchValues.of(values.mean(axis=0)), BenchValues.of(errors)
 

@@ -7,7 +7,7 @@ much light as there is, and modelled frames differ little from measured ones.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,7 +30,7 @@ _LAMP = (
 _EXACT, _EXACT_OF_BENCH = 1e-3, 2.5e-3  # residuals of frames without noise
 MOVED_BY, SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
 _SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
-# Cost of an explanation that is good enough, and factor of the usual residual from which on frames are inconsistent.
+# Cost of an explanation that is good enough, and factor of the usual residual above which frames are inconsistent.
 _ENOUGH = 2.25, 2.5
 _ENOUGH_OF_BENCH = 1.56, 1.25  # where the noise is known
 _PASSES = 4  # in which the light of the modelled frames gives the next light
@@ -50,7 +50,7 @@ class Trial(NamedTuple):
     n_iterations: NDArray[np.int64]  # (k,)
     converged: NDArray[np.bool_]  # (k,)
     n_unsolved: NDArray[np.int64]  # (k,)
-    residual: NDArray[np.float32]  # (k,), NaN if not judged
+    residual: NDArray[np.floating]  # (k,), NaN if not judged
     usual: NDArray[np.float64]  # (k,), of frames like those of the calibration
     ratio: NDArray[np.float64]  # (k,), light of the frames over that of their model
     cost: NDArray[np.float64]  # (k,), of both: 1 for frames like those of the calibration
@@ -78,8 +78,7 @@ class Exposures:
         self._counts, self._level = counts, level
         self._start, self._method, self._judge = start, method, judge
         self._prediction = prediction if work else calibration._prediction
-        self._predicted = self._prediction is not None and method is None  # counts are compared, not ideal frames
-        self._enough, self._unusual = _ENOUGH_OF_BENCH if self._predicted else _ENOUGH
+        self._enough, self._unusual = _ENOUGH_OF_BENCH if self._prediction and not method else _ENOUGH
         self._raw, self.good, self.n_bad, self.n_saturated = self._work.cleaned(counts, level, self._work.good)
         values = self._work.resampled(self._raw)
         self.n_good = np.maximum(np.count_nonzero(self.good, axis=(1, 2)), 1)
@@ -139,22 +138,23 @@ class Exposures:
     def _attempt(self, which: NDArray[np.intp], light: NDArray[np.float64]) -> Trial:
         """Phases of some exposures with a light."""
         work, good = self._work, self.good[which]
-        frames = self._ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
+        frames: Any = self._ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
         frames[~self.lit[which]] = work.flat_frames  # of a flat wavefront: they converge at once
         if self._method is None:
             np.maximum(frames, 0, out=frames)
-        start, prediction = None if self._start is None else self._start[which], self._prediction
-        solved = work.solve(frames, good, start, None if prediction else self._method)
-        if prediction:
-            lit = self.lit[which]
-            frames, quiet, solved, missing, noise = prediction.corrected(self._raw[which], light, lit, good, solved)
+        start, corrected = None if self._start is None else self._start[which], None
+        solved = work.solve(frames, good, start, None if self._prediction else self._method)
+        if self._prediction:
+            corrected = self._prediction.corrected(self._raw[which], light, self.lit[which], good, solved)
+            frames, solved = corrected.frames, corrected.solved
             if self._method:
-                solved = work.solve(quiet, good, start, self._method)
-        usual, residual, ratio = self._usual(light, self.noise[which]), *np.full((2, len(which)), np.nan)
+                solved = work.solve(corrected.quiet, good, start, self._method)
+        usual, (residual, ratio) = self._usual(light, self.noise[which]), np.full((2, len(which)), np.nan)
         if self._judge:
             residual, ratio = work.compared(solved.phase, frames, good)
-        if self._judge and self._predicted:
-            residual, usual = missing, np.maximum(noise, max(self._of.residual, _EXACT_OF_BENCH))
+        if self._judge and corrected and not self._method:  # counts are compared, not ideal frames
+            residual = corrected.residual
+            usual = np.maximum(corrected.noise, max(self._of.residual, _EXACT_OF_BENCH))
         ratio = ratio / self._of.light_ratio
         unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(self.n_good[which]))
         cost = np.where(self.lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)

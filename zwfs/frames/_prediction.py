@@ -1,8 +1,8 @@
 """Camera frames that phases predict with all of a fitted bench, and corrections of the phases by what they miss.
 
-The linear road of a calibration turns counts c into ideal frames, whose phase follows from a model without blur,
-pixels that are lit in part, and the relay. Let F(phi) be the counts that the whole model of the bench predicts, and
-I(phi) the ideal frames. A correction solves
+The linear road of a calibration turns counts c into ideal frames, whose phase follows from a model of the sensor
+alone. Let F(phi) be the counts that the whole model of the bench predicts, with blur, edges and relay, and I(phi)
+the ideal frames. A correction solves
 
     I(phi_next) = I(phi) + B (c - F(phi)),
 
@@ -47,7 +47,7 @@ class Corrected(NamedTuple):
 
 
 class Prediction:
-    """Constants of the model of a fitted bench, in single precision, on the boxes and the grid of a calibration."""
+    """Model of a fitted bench, in single precision, on the boxes and the grid of a calibration."""
 
     def __init__(self, calibration: Calibration, bench: BenchFit) -> None:
         grid, model = calibration._work, bench.model
@@ -96,9 +96,9 @@ class Prediction:
         return np.stack([image[cut] for image, cut in zip(images, self._cuts, strict=True)]) - self._background
 
     def corrected(self, raw: NDArray, light: NDArray, lit: NDArray, good: NDArray, solved: Solved) -> Corrected:
-        """Correct phases of counts on the boxes, (k, 2, h, w), with their light, (k,), and good points, (k, ny, nx).
+        """Correct phases of counts on the boxes, (k, 2, h, w), with their light, (k,), and good points.
 
-        Those of exposures that are not lit, (k,), stay.
+        Those of exposures that are not lit, (k,), stay. The points are maps (k, ny, nx).
         """
         grid, scale = self._grid, light[:, None, None, None].astype(np.float32)
         variance = np.maximum(raw + self._background, 0) / self._bench.gain + self._bench.noise**2
@@ -144,7 +144,7 @@ class Prediction:
         return images
 
     def _fine(self, phase: NDArray) -> NDArray[np.float32]:
-        """Phase on the fine grid: a plane in each pixel, as steep as its neighbours are without a jump or a wrap."""
+        """Phase on the fine grid: a plane in each pixel, which neither jumps nor wraps make steep."""
         wide, f = phase.ravel()[self._continued], self._flat.camera.f
         places = ((np.arange(f) + 0.5) / f - 0.5).astype(np.float32)
         fine = wide[:, None, :, None]

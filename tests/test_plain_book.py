@@ -60,7 +60,6 @@ def test_figures_have_cards_with_their_notebooks_and_the_address_leads_to_the_fr
         assert cards, page.name
         for link in (link for card in cards for link in card.select("a.download")):
             assert (page.parent / link["href"]).resolve().is_file()
-    assert (plain_book / "_static" / "mathjax" / "tex-chtml.js").is_file()
     assert 'url=book/index.html"' in (plain_book / "index.html").read_text("utf-8")
 
 

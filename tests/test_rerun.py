@@ -383,7 +383,7 @@ def test_odd_names_are_shown_as_they_are(project, browser):
     _, asked = watch(page)
     page.goto(file.as_uri())
     page.wait_for_load_state("networkidle")
-    page.wait_for_selector("mjx-container svg")
+    page.wait_for_selector("math")
     assert [url for url in asked if not url.startswith("data:")] == [file.as_uri()]
     assert page.title() == "Title of fig02_works"
     cells = page.locator(".cell_output td:first-child").all_inner_texts()

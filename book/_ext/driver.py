@@ -4,7 +4,6 @@ Pyodide imports this file in the worker of `book/_static/run-worker.js`. It repl
 """
 
 import ast
-import html
 import io
 import json
 import os
@@ -100,23 +99,15 @@ def cell(source: str) -> str:
 
 
 def in_html(markdown: str) -> str:
-    """Return Markdown as HTML: paragraphs, lists, tables, links to pages, formulas; HTML in it stays text."""
+    """Return Markdown as HTML: paragraphs, lists, tables, links to pages; HTML in it stays text."""
     from markdown_it import MarkdownIt
-    from mdit_py_plugins.dollarmath import dollarmath_plugin
 
     parser = MarkdownIt("commonmark", {"html": False}).enable("table")
-    dollarmath_plugin(parser, renderer=_formula)
     tokens = parser.parse(markdown)
     for token in (part for block in tokens for part in block.children or ()):
         if address := token.attrs.get("href"):
             token.attrs["href"] = re.sub(r"\.(ipynb|md)(?=#|$)", ".html", str(address))
     return parser.renderer.render(tokens, parser.options, {})
-
-
-def _formula(source: str, options: dict[str, Any]) -> str:
-    """Return a formula as MathJax reads it."""
-    begin, end = ("\\[", "\\]") if options["display_mode"] else ("\\(", "\\)")
-    return f"{begin}{html.escape(source)}{end}"
 
 
 def example(source: str) -> str:

@@ -1,7 +1,8 @@
-"""Finish of the pages: numbers, variants and sizes of pictures, names of folds, MathJax without the network."""
+"""Finish of the pages: numbers, variants and sizes of pictures, names of folds, icons."""
 
+import base64
 import copy
-import importlib.util
+import io
 import os
 import re
 import struct
@@ -11,6 +12,8 @@ from urllib.parse import unquote
 
 from bs4 import BeautifulSoup, Tag
 from docutils import nodes
+from fontTools.subset import Subsetter
+from fontTools.ttLib import TTFont
 from sphinx.application import Sphinx
 from sphinx.util.fileutil import copy_asset_file
 
@@ -35,6 +38,10 @@ POWER = re.compile(r"(?<![\w.])(-?\d(?:\.\d+)?)e([+-])0*(\d+)\b")
 MINUS = re.compile(r"(?<![\w.)-])-(?=\d)")
 PERCENT = re.compile(r"(?:(?<=\d)|^) ?%")  # the number may be in the element before
 DIGITS = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+ICON = re.compile(r"(?:\.fa-[\w-]+:before,?)+\{content:[^}]*\}")
+CLASS = re.compile(r"fa-[\w-]+")
+LETTER = re.compile(r"\\(f[\da-f]{3})\b|([\uf000-\uf8ff])")
+FONT = re.compile(r"url\([^)]*fa-solid-900[^}]*")
 IMPORTED = re.compile(r"^from zwfs[\w.]* import (\([^)]*\)|.*)$", re.MULTILINE)
 
 
@@ -50,6 +57,8 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     for image in body.find_all("img"):
         if picture := pictures.get(unquote(image["src"].rpartition("/")[2])):
             image["width"], image["height"] = map(str, size(picture))
+    for image in body.find_all("img"):
+        image["loading"] = "lazy"
     for image in body.select("figure > img"):
         image.wrap(body.new_tag("a", href=image["src"], title="Open the figure alone"))
         image.parent.wrap(body.new_tag("div", **{"class": "wide-figure"}))
@@ -65,14 +74,7 @@ def finish_page(app: Sphinx, page: str, template: str, context: dict[str, Any], 
     if body.find(id="phasor"):
         app.add_css_file("phasor.css")
         app.add_js_file("phasor.js", loading_method="defer")
-    if not body.select_one(".math"):
-        context["script_files"] = [script for script in context["script_files"] if not is_mathjax(script)]
     context["body"] = str(body)
-
-
-def is_mathjax(script: Any) -> bool:
-    """Return whether a script of a page is MathJax, or sets it up."""
-    return "mathjax" in str(script.filename).lower() or "MathJax" in script.attributes.get("body", "")
 
 
 def name_cells(body: Tag) -> None:
@@ -166,27 +168,41 @@ def finish_folder(app: Sphinx, exception: Exception | None) -> None:
     """Copy what pages load, leave out what they do not need, and write a page for each address that moved."""
     if exception is not None or app.builder.format != "html":
         return
-    copy_mathjax(Path(app.outdir, "_static", "mathjax"))
-    # The style sheets of the theme draw the same icons from a font.
-    Path(app.outdir, "_static", "scripts", "fontawesome.js").write_text("", "utf-8")
+    drop_icons(Path(app.outdir))
     for old, new in app.config.moved_pages.items():
         page = Path(app.outdir, f"{old}.html")
         address = os.path.relpath(Path(app.outdir, f"{new}.html"), page.parent)
         page.write_text(MOVED.format(address=Path(address).as_posix()), "utf-8")
 
 
-def copy_mathjax(folder: Path) -> None:
-    """Copy the part of MathJax that pages load: mathematics needs no network."""
-    package = Path(importlib.util.find_spec("sphinx-mathjax-offline").origin).parent / "static" / "mathjax"
-    for file in (package / "tex-chtml.js", *(package / "output" / "chtml" / "fonts").rglob("*.woff")):
-        target = folder / file.relative_to(package)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        copy_asset_file(file, target)
+def drop_icons(folder: Path) -> None:
+    """Keep only the icons that pages show: their rules, and their letters in the font. A script has them again."""
+    static = folder / "_static"
+    (static / "scripts" / "fontawesome.js").write_text("", "utf-8")
+    pages = "".join(page.read_text("utf-8") for page in folder.rglob("*.html"))
+    shown = set(re.findall(r"\bfa-[\w-]+", pages))
+    sheet = static / "styles" / "pydata-sphinx-theme.css"
+    style = ICON.sub(lambda rule: rule[0] if shown & set(CLASS.findall(rule[0])) else "", sheet.read_text("utf-8"))
+    sheets = style, (static / "styles" / "sphinx-book-theme.css").read_text("utf-8")
+    letters = {int(code, 16) if code else ord(letter) for code, letter in LETTER.findall("".join(sheets))}
+    file = static / "vendor" / "fontawesome" / "webfonts" / "fa-solid-900.ttf"
+    sheet.write_text(FONT.sub(f"url({font_with(letters, file)})", style), "utf-8")
+
+
+def font_with(letters: set[int], file: Path) -> str:
+    """Return a font that holds only these letters, as a data URL."""
+    font = TTFont(file, recalcTimestamp=False)
+    subsetter = Subsetter()
+    subsetter.populate(unicodes=letters)
+    subsetter.subset(font)
+    content = io.BytesIO()
+    font.save(content)
+    return f"data:font/ttf;base64,{base64.b64encode(content.getvalue()).decode()}"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Finish each page, and their folder at the end."""
     app.add_config_value("moved_pages", {}, "html")
-    app.connect("html-page-context", finish_page, priority=900)  # after MathJax, which MyST-NB adds to every page
+    app.connect("html-page-context", finish_page, priority=900)
     app.connect("build-finished", finish_folder)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -53,7 +53,7 @@ def data() -> dict[str, Any]:
         "inside": _encode(pupil.inside.astype(np.uint8)),
         "diameters": diameters.tolist(),
         "functions": _encode(functions),
-        "cores": _encode(cores.astype(np.float32)),
+        "cores": _encode(cores[..., *np.tril_indices(cores.shape[-1])].astype(np.float32)),
         "orders": [zwfs.noll_to_nm(j) for j in range(2, N_MODES + 2)],
         "screens": _encode(screens(pupil).astype(np.float32)),
         "designs": designs(),

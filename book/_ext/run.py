@@ -33,7 +33,7 @@ DATA = "_static/run"
 REPOSITORY = "_static/zwfs.zip"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
 FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
-PURE = "array-api-compat", "markdown-it-py", "mdit-py-plugins", "mdurl"  # packages that Pyodide does not have
+PURE = "array-api-compat", "markdown-it-py", "mdurl"  # packages that Pyodide does not have
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
 
 

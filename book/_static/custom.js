@@ -1,18 +1,20 @@
-// Text that holds mathematics appears once that is set, so that nothing moves afterwards.
-document.documentElement.classList.add("setting");
-addEventListener("load", async () => {
-  await window.MathJax?.startup?.promise;
-  document.documentElement.classList.remove("setting");
-});
+// The theme sets its colours late: boxes would grow by their borders, and a dark page would load the light pictures.
+if (document.documentElement.dataset.mode === "auto")
+  document.documentElement.dataset.theme = matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light";
 
 // Browsers block pages from the file system from reading other files: a search there shows no summaries.
 if (location.protocol === "file:") DOCUMENTATION_OPTIONS.SHOW_SEARCH_SUMMARY = false;
 
-// Tables that are wider than the page scroll: only those are a stop for the Tab key, with a name.
-function nameWideTables() {
-  for (const box of document.querySelectorAll(".pst-scrollable-table-container")) {
+// Text with formulas appears once their font is set, so that nothing moves afterwards.
+document.documentElement.classList.add("setting");
+document.fonts.load('1em "STIX Two Math"').finally(() => document.documentElement.classList.remove("setting"));
+
+// Tables and formulas that are wider than the page scroll: only those are a stop for the Tab key, with a name.
+function nameWideBoxes() {
+  for (const box of document.querySelectorAll(".pst-scrollable-table-container, .formula")) {
     const wide = box.scrollWidth > box.clientWidth;
-    for (const [name, value] of Object.entries({ tabindex: "0", role: "group", "aria-label": "Table" })) {
+    const label = box.matches(".formula") ? "Formula" : "Table";
+    for (const [name, value] of Object.entries({ tabindex: "0", role: "group", "aria-label": label })) {
       if (wide) box.setAttribute(name, value);
       else box.removeAttribute(name);
     }
@@ -26,7 +28,7 @@ function fadeWideBoxes() {
 }
 
 for (const event of ["load", "resize"]) {
-  addEventListener(event, nameWideTables);
+  addEventListener(event, nameWideBoxes);
   addEventListener(event, fadeWideBoxes);
 }
 addEventListener("scroll", fadeWideBoxes, { capture: true, passive: true });

@@ -130,16 +130,18 @@ window.zwfsLive = (() => {
   const nProducts = products[0].length;
   const cores = decode(data.cores);
 
-  // Core of one class at a diameter: the polynomial through the cores that zwfs gave.
+  // Core of one class at a diameter: the polynomial through the cores that zwfs gave, of which it stored one half.
   function coreOf(diameter, kind) {
     const weights = data.diameters.map((own) =>
       data.diameters.reduce((w, other) => (other === own ? w : (w * (diameter - other)) / (own - other)), 1),
     );
     const core = new Float64Array(nProducts ** 2);
-    weights.forEach((weight, m) => {
-      const start = (4 * m + kind) * core.length;
-      for (let k = 0; k < core.length; k++) core[k] += weight * cores[start + k];
-    });
+    const nPairs = (nProducts * (nProducts + 1)) / 2;
+    for (let i = 0, pair = 0; i < nProducts; i++)
+      for (let j = 0; j <= i; j++, pair++) {
+        const value = weights.reduce((sum, weight, m) => sum + weight * cores[(4 * m + kind) * nPairs + pair], 0);
+        core[i * nProducts + j] = core[j * nProducts + i] = value;
+      }
     return core;
   }
 

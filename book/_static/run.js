@@ -136,7 +136,6 @@
       if (!text.parentElement.closest("code, .math")) text.data = written(text.data);
     }
     beside(output.querySelector(":scope > .run-whole"), yours);
-    window.MathJax?.typesetPromise?.([yours]);
   }
 
   // The page of a notebook: the form, the run and its results.

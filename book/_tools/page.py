@@ -1,9 +1,8 @@
-"""An executed notebook as one HTML file, with its pictures and the program for mathematics in it."""
+"""An executed notebook as one HTML file, with its pictures and the font of its formulas in it."""
 
 import base64
 import copy
 import html
-import importlib.util
 import io
 import mimetypes
 import re
@@ -22,6 +21,7 @@ from .project import Project
 
 STYLE = Path(__file__).with_name("standalone.css")
 COLOUR = re.compile(r"\x1b\[[0-9;]*m")
+MATHEMATICS = "book._ext.mathematics"
 # Extensions for the other pages of the book and for its navigation.
 OMITTED = ("book._ext.", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx_book_theme", "sphinx_comments",
            "sphinx_copybutton", "sphinx_togglebutton")  # fmt: skip
@@ -33,19 +33,11 @@ FRAME = """<!DOCTYPE html>
 <link rel="icon" href="data:,">
 <title>{title}</title>
 <style>{style}</style>
-{scripts}
 </head>
 <body>
 <main>{body}</main>
 </body>
 </html>
-"""
-MATHJAX = """
-window.MathJax = {
-  tex: {tags: "none"},
-  svg: {fontCache: "global"},
-  options: {enableMenu: false, ignoreHtmlClass: "tex2jax_ignore|document", processHtmlClass: "math"}
-};
 """
 # Elements that the page does not need; Markdown can hold any HTML.
 ACTIVE = ["script", "iframe", "object", "embed", "base", "meta", "link", "form"]
@@ -107,10 +99,11 @@ def _sphinx(source: Path, output: Path, document: str) -> str:
         sourcedir=source,
     )
     config |= {
-        "extensions": [name for name in config["extensions"] if not name.startswith(OMITTED)],
+        "extensions": [MATHEMATICS, *(name for name in config["extensions"] if not name.startswith(OMITTED))],
         "html_theme": "basic",
         "html_theme_options": {},
         "html_static_path": [],
+        "templates_path": [],
         "html_css_files": [],
         "html_copy_source": False,
         "html_permalinks": False,
@@ -150,11 +143,9 @@ def _embed(output: Path, document: str, published: set[str], changed: bool) -> s
             link.unwrap()
     sheets = [sheet["href"].partition("?")[0] for sheet in soup.find_all("link", rel="stylesheet")]
     style = [(file.parent / sheet).read_text("utf-8") for sheet in sheets if not urlsplit(sheet).scheme]
-    scripts = [MATHJAX, _mathjax()] if body.find(class_="math") else []
     return FRAME.format(
         title=html.escape(body.find("h1").get_text()),
         style="\n".join([*style, STYLE.read_text("utf-8")]),
-        scripts="\n".join(f"<script>{script}</script>" for script in scripts),
         body="".join(map(str, body.contents)),
     )
 
@@ -163,10 +154,3 @@ def _data(file: Path) -> str:
     """Return a data URL that holds a file."""
     kind = mimetypes.guess_type(file.name)[0]
     return f"data:{kind};base64,{base64.b64encode(file.read_bytes()).decode()}"
-
-
-def _mathjax() -> str:
-    """Return MathJax as one script; it draws the letters, so it loads no fonts."""
-    package = importlib.util.find_spec("sphinx-mathjax-offline")
-    code = Path(package.origin).parent / "static" / "mathjax" / "tex-svg-full.js"
-    return code.read_text("utf-8").replace("</script", "<\\/script")

@@ -89,6 +89,7 @@ class Prediction:
             for arm in (0, 1)
         ])  # fmt: skip
         self._cuts = _cuts(grid, self._windows)
+        self._calm = ~self._under(self._inside & ~self._inner)
 
     def counts(self, phase: NDArray) -> NDArray[np.float32]:
         """Counts of the boxes, (2, h, w), less dark and background, of a phase (n, n)."""
@@ -105,8 +106,11 @@ class Prediction:
         usable = np.stack([~self._under(self._inside & ~points) for points in good]) & lit[:, None, None, None]
         residual = self._residual(raw, scale, solved.phase, usable)
         n_iterations = solved.n_iterations
-        for _ in range(_N_CORRECTIONS):
-            frames = self._ideal(solved.phase, _significant(residual, variance, usable) / scale)
+        for correction in range(_N_CORRECTIONS):
+            missing = _significant(residual, variance, usable) / scale
+            if correction:  # a second one would overshoot where pixels are lit in part
+                missing *= self._calm
+            frames = self._ideal(solved.phase, missing)
             solved = grid.solve(np.maximum(frames, 0), good, solved.phase)
             n_iterations = n_iterations + solved.n_iterations
             residual = self._residual(raw, scale, solved.phase, usable)
@@ -189,6 +193,9 @@ def _slopes(phase: NDArray, pairs: NDArray[np.bool_]) -> NDArray[np.float32]:
 def _significant(residual: NDArray, variance: NDArray, usable: NDArray) -> NDArray[np.float64]:
     """Residuals, (k, 2, h, w), less the share that noise makes up among their neighbours (Wiener's filter)."""
     smooth = ndimage.gaussian_filter(residual, _SMOOTHING, axes=(2, 3))
+    steps = np.diff(np.where(usable, residual / np.sqrt(variance), np.nan), axis=3)
+    scale = np.nanmedian(np.abs(steps), axis=(1, 2, 3), keepdims=True) * (1.4826 / np.sqrt(2))
+    variance = variance * np.maximum(1, scale) ** 2
     squares, weight = (
         ndimage.gaussian_filter(values, _AROUND, axes=(2, 3))
         for values in (usable * smooth**2 / (_passed() * variance), usable.astype(np.float32))

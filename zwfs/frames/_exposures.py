@@ -138,7 +138,9 @@ class Exposures:
     def _attempt(self, which: NDArray[np.intp], light: NDArray[np.float64]) -> Trial:
         """Phases of some exposures with a light."""
         work, good = self._work, self.good[which]
-        frames: Any = self._ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
+        frames: Any = (
+            self._ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
+        )
         frames[~self.lit[which]] = work.flat_frames  # of a flat wavefront: they converge at once
         if self._method is None:
             np.maximum(frames, 0, out=frames)

@@ -105,9 +105,10 @@ class Prediction:
         variance = np.maximum(raw + self._background, 0) / self._bench.gain + self._bench.noise**2
         usable = np.stack([~self._under(self._inside & ~points) for points in good]) & lit[:, None, None, None]
         residual = self._residual(raw, scale, solved.phase, usable)
+        shown = variance * _excess(residual / np.sqrt(variance), usable & grid.watched)
         n_iterations = solved.n_iterations
         for correction in range(_N_CORRECTIONS):
-            missing = _significant(residual, variance, usable) / scale
+            missing = _significant(residual, shown, usable) / scale
             if correction:  # a second one would overshoot where pixels are lit in part
                 missing *= self._calm
             frames = self._ideal(solved.phase, missing)
@@ -121,7 +122,7 @@ class Prediction:
             np.sqrt(np.sum(squares / self._unit**2, axis=(1, 2, 3), where=chosen) / number) / light
             for squares in (residual**2, variance)
         ]
-        parts = residual, _significant(residual, variance, usable)
+        parts = residual, _significant(residual, shown, usable)
         frames, quiet = (self._ideal(solved.phase, missing / scale) for missing in parts)
         return Corrected(frames, quiet, solved._replace(n_iterations=n_iterations), *rms)
 
@@ -190,12 +191,17 @@ def _slopes(phase: NDArray, pairs: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.where(ahead * behind > 0, np.clip((ahead + behind) / 2, -least, least), 0)
 
 
+def _excess(pulls: NDArray, where: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Variance of differences of neighbouring pixels over that of their noise, at least 1, (k, 1, 1, 1)."""
+    pairs = where[..., 1:] & where[..., :-1]
+    steps = np.abs(np.diff(pulls, axis=3))
+    medians = [np.median(step[pair]) if pair.any() else 0.0 for step, pair in zip(steps, pairs, strict=True)]
+    return np.maximum(1, 1.4826**2 / 2 * np.square(medians))[:, None, None, None]
+
+
 def _significant(residual: NDArray, variance: NDArray, usable: NDArray) -> NDArray[np.float64]:
     """Residuals, (k, 2, h, w), less the share that noise makes up among their neighbours (Wiener's filter)."""
     smooth = ndimage.gaussian_filter(residual, _SMOOTHING, axes=(2, 3))
-    steps = np.diff(np.where(usable, residual / np.sqrt(variance), np.nan), axis=3)
-    scale = np.nanmedian(np.abs(steps), axis=(1, 2, 3), keepdims=True) * (1.4826 / np.sqrt(2))
-    variance = variance * np.maximum(1, scale) ** 2
     squares, weight = (
         ndimage.gaussian_filter(values, _AROUND, axes=(2, 3))
         for values in (usable * smooth**2 / (_passed() * variance), usable.astype(np.float32))

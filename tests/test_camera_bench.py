@@ -311,7 +311,7 @@ def test_call_without_a_prior_uses_all_of_the_fit(calibrated, rms, share):
     assert not calibration(counts).flags.any()
 
 
-@pytest.mark.parametrize("change", [{"blur": 1.0}, {"leakage": 0.08}, {"offsets": ((0.5, -0.1), (0.15, 0.25))}])
+@pytest.mark.parametrize("change", [{"blur": 1.0}, {"leakage": 0.08}, {"offsets": ((0.8, -0.1), (0.45, 0.25))}])
 def test_frames_that_their_phases_do_not_predict_are_inconsistent(calibrated, change):
     """The phase of the ideal frames alone explains some of these, which are wrong by 0.04 rad and more."""
     bench, calibration = calibrated

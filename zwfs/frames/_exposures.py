@@ -32,7 +32,7 @@ MOVED_BY, SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
 _SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
 # Cost of an explanation that is good enough, and factor of the usual residual above which frames are inconsistent.
 _ENOUGH = 2.25, 2.5
-_ENOUGH_OF_BENCH = 1.56, 1.25  # where the noise is known
+_ENOUGH_OF_BENCH = 1.96, 1.4  # where the noise is known
 _PASSES = 4  # in which the light of the modelled frames gives the next light
 _STEPS = 0.08, 0.08, 0.04, 0.02, 0.01  # relative changes of the light
 _BETTER = 0.8  # of the cost: a smaller gain moves no light

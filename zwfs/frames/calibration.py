@@ -457,7 +457,7 @@ class Calibration(Immutable):
             Replaces that of the calibration.
         largest_residual : float, optional
             Residual above which a frame is inconsistent. By default it is 2.5 times the residual that the frames
-            of the calibration would have with the light and the noise of this one. With a `bench` it is 1.25 times
+            of the calibration would have with the light and the noise of this one. With a `bench` it is 1.4 times
             the noise of this frame, the residual of the calibration or 0.0025, whichever is largest.
         judge : bool
             Whether to compare the frames with their model. Without it residual and displacement are NaN, no frame

@@ -29,7 +29,7 @@ class Flag(IntFlag):
         Some of these are saturated.
     INCONSISTENT
         The residual exceeds 2.5 times that of the calibration's frames, more in faint light, or the call's limit.
-        With a fitted bench, it exceeds 1.25 times the noise: the frame is not the one that its phase predicts.
+        With a fitted bench, it exceeds 1.4 times the noise: the frame is not the one that its phase predicts.
     NOT_CONVERGED
         The iteration used all its steps.
     MOVED

@@ -1,15 +1,18 @@
 """Frames of a vector sensor that HCIPy simulates: registration and phase."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from astropy.io import fits
 
+from zwfs.frames import Calibration
 from zwfs.frames.__main__ import main
+from zwfs.frames._fit import _remarks
 from zwfs.frames.pipeline import Optics, near_edges, phase_of, recover_phase, reduce_frames
 from zwfs.frames.refine import fit, steps
-from zwfs.frames.registration import Image, register_frames
+from zwfs.frames.registration import Image, find_pupils, register_frames
 from zwfs.frames.verdict import CameraNoise, judge
 
 from .hcipy_bench import HcipyBench
@@ -129,6 +132,135 @@ def test_pupils_with_many_edges_are_measured(aperture, diameter_known, least):
     errors = difference(bench, recover_phase(reduce_frames(registered, Optics())))
     assert np.count_nonzero(np.isfinite(errors)) > 0.98 * np.count_nonzero(bench.fully_lit)
     assert np.nanstd(errors) < least
+
+
+# Frames of any bench: two arms on one camera image
+
+
+@pytest.fixture(scope="module")
+def arms():
+    """A bench with a plain disc, its screen of 0.3 rad rms, and camera images: frame, clear frame and dark."""
+    bench = HcipyBench(pixels=40, side=56, photons=1e4)
+    screen = bench.smooth(0.3, 3)
+    frame, clear = (np.hstack(bench.counts(screen, (2, masked), bool(masked))) for masked in (1, 0))
+    return bench, screen, frame, clear, np.random.default_rng(5).normal(300, 5, frame.shape)
+
+
+def arms_error(arms, phase, corner=(0, 0)):
+    """Rms error at fully lit pixels, radian, of a phase that begins at a corner: 0.010 without faults."""
+    bench, screen, *_ = arms
+    return np.nanstd(bench.difference(phase.astype(float), corner, screen))
+
+
+def test_windows_and_times_of_the_headers_place_and_scale_frames(arms, tmp_path, monkeypatch):
+    """Frames of another window and time than the clear frames, darks of the whole detector."""
+    monkeypatch.chdir(tmp_path)
+    _, _, frame, clear, dark = arms
+    ny, nx = frame.shape
+    for name, counts, start, time in (
+        ("frame", 3 * (frame + dark)[3:, 2:], (3, 2), 3.0),
+        ("clear", clear + dark, (0, 0), 1.0),
+        ("dark", dark, (0, 0), 1.0),
+        ("dark3", 3 * dark, (0, 0), 3.0),
+    ):
+        header = fits.Header({"EXPTIME": time, "DETSEC": f"[{start[1] + 1}:{nx},{start[0] + 1}:{ny}]"})
+        fits.writeto(f"{name}.fits", counts, header)
+    files = ["--frames", "frame.fits", "--pupils", "clear.fits", "--dark", "dark3.fits", "dark.fits"]
+    optics = ["--phase-shifts", "1.5708", "-1.5708", "--diameter", "1.06"]
+    assert main(["calibrate", "bench.npz", *files, *optics]) == 0
+    assert main(["reconstruct", "frame.fits", "--calibration", "bench.npz", "-o", "phase.fits", "--quiet"]) == 0
+    header = fits.getheader("phase.fits")
+    corner = header["CROPROW"] + 3, header["CROPCOL"] + 2
+    assert arms_error(arms, fits.getdata("phase.fits")[0], corner) < 0.015
+
+
+def test_clear_frames_of_another_window_are_placed_without_a_header(arms):
+    _, _, frame, clear, _ = arms
+    phases = phase_of(frame, clear[2:-3, 1:-2])
+    origins = phases.measurement.registered.origins
+    np.testing.assert_allclose(origins[:2] - origins[2:], [[2, 1]] * 2, atol=1e-9)
+
+
+def spoiled(arms, kind):
+    """Frame and clear frame with a fault."""
+    frame, clear = arms[2].copy(), arms[3].copy()
+    if kind == "dead column":
+        frame[:, 25] = clear[:, 25] = 0
+    elif kind == "hot column":
+        frame[:, 25] = clear[:, 25] = 65535
+    elif kind == "dead row of the frame":
+        frame[30] = 0
+    elif kind == "groups of hot pixels":
+        for row, column in ((20, 25), (35, 30), (28, 80)):
+            for image in (frame, clear):
+                image[row : row + 2, column : column + 2] += 12000
+    else:  # surroundings without counts around a frame with a background
+        frame, clear = (np.pad(image + 100, 6) for image in (frame, clear))
+    return frame, clear
+
+
+@pytest.mark.parametrize(
+    "kind", ["dead column", "hot column", "dead row of the frame", "groups of hot pixels", "padded"]
+)
+def test_faults_of_a_camera_are_found_without_a_map(arms, kind):
+    phases = phase_of(*spoiled(arms, kind))
+    pad = 6 * (kind == "padded")
+    assert arms_error(arms, phases.phase, phases.measurement.registered.corner - pad) < 0.015
+
+
+def test_arrays_have_a_saturation_and_an_exposure(arms):
+    _, _, frame, clear, _ = arms
+    longer = 3 * frame
+    level = np.quantile(longer, 0.98)
+    phases = phase_of(np.minimum(longer, level), clear, saturation=level, exposure=3.0)
+    assert arms_error(arms, phases.phase, phases.measurement.registered.corner) < 0.015
+    assert phases.measurement.n_bad > 20
+
+
+def test_frames_that_no_phase_explains_give_a_warning(arms):
+    _, _, frame, clear, _ = arms
+    half = frame.shape[1] // 2
+    for wrong in (np.hstack([frame[:, :half], frame[:, : half - 1 : -1]]), 2.5 * frame):
+        with pytest.warns(UserWarning, match="The frames differ from their model by"):
+            phases = phase_of(wrong, clear)
+    assert "a mask makes no light" in judge(phases).findings["warnings"]
+
+
+def test_verdict_names_cosmic_rays(arms):
+    _, _, frame, clear, _ = arms
+    frame = frame.copy()
+    frame[18:21, 28:30] += 9000
+    frame[36, 30:34] += 9000
+    assert "cosmic rays" in judge(phase_of(frame, clear)).findings["warnings"]
+
+
+def test_close_pupils_are_found(arms):
+    clear = arms[3]
+    close = np.hstack([clear[:, :51], clear[:, 61:]])  # 6 pixels apart
+    assert [round(circle.diameter) for circle in find_pupils(Image.of(close, "clear"), 2)] == [40, 40]
+
+
+def test_messages_name_the_cause(arms, tmp_path):
+    _, _, frame, clear, _ = arms
+    half = frame.shape[1] // 2
+    for name, counts in (("frame", frame), ("clear", clear)):
+        np.save(tmp_path / f"{name}.npy", np.stack([counts[:, :half], counts[:, half:]]))
+    files = [tmp_path / "frame.npy"], [tmp_path / "clear.npy"]
+    with pytest.raises(ValueError, match="n_images = 2 takes the two exposures of frame"):
+        Calibration.from_files(*files, diameter=1.06, phase_shifts=(np.pi / 2, -np.pi / 2))
+    with pytest.raises(ValueError, match="frames less the dark: all pixels are NaN"):
+        phase_of(frame * np.nan, clear)
+    lit = clear > clear.max() / 2
+    marked = Image(np.where(lit, 0, clear), lit)
+    with pytest.raises(ValueError, match="of its pixels are marked as bad: expected a map that is 0 where good"):
+        find_pupils(marked, 2)
+
+
+def test_weak_commands_are_remarked():
+    data = SimpleNamespace(phases=0.01 * np.random.default_rng(1).normal(size=(3, 8, 8)), light=[0, [1.0]])
+    point = SimpleNamespace(problem=SimpleNamespace(free=()))
+    [remark] = _remarks(data, point, np.ones(8), (), False)
+    assert remark.endswith("expected 0.02 or more.")
 
 
 # One mask, one image

@@ -73,7 +73,7 @@ def _add_calibrate(parser: argparse.ArgumentParser) -> None:
     add("--pupil-diameter", type=float, metavar="PIXEL", help="default: from the clear frames")
     trust: Any = {"dest": "subpixel", "action": "store_false", "default": absent}
     add("--no-registration", help="trust the outlines", **trust)
-    add("--exposure", type=float, default=absent, help="of the frames over that of the clear frames: 1")
+    add("--exposure", type=float, default=absent, help="of frames over that of clear frames; default: EXPTIME")
     add("--saturation", type=float, metavar="COUNTS", help="default: SATURATE, or the type's largest")
     add("--fit", dest="fitted", nargs="+", default=(), metavar="NAME", help="parameter to fit")
     add("--commands", metavar="FILE", help="known phases of the frames, radian: fit the bench with them")

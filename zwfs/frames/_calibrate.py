@@ -20,7 +20,7 @@ from zwfs.frames._fitted import Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
-from zwfs.frames.files import CameraFile, averaged, combined, read, read_all
+from zwfs.frames.files import CameraFile, averaged, combined, read, read_all, relative_exposure
 from zwfs.frames.pipeline import Measurement, Optics, reduce_frames
 from zwfs.frames.refine import _check_fit, fit
 from zwfs.frames.registration import Image, check_centers, check_diameter, find_pupils, register_frames
@@ -47,14 +47,18 @@ class Source(NamedTuple):
         try:
             optics = sources[0].optics(self.diameter, self.phase_shifts)
             _check_fit("fitted", fitted, optics)
-            registered = register_frames(masked, unmasked, **self.settings, n_pupils=len(optics.phase_shifts))
+            settings = {"exposure": relative_exposure(sources[0], sources[len(frames)])} | self.settings
+            registered = register_frames(masked, unmasked, **settings, n_pupils=len(optics.phase_shifts))
             registered, optics = fit(registered, optics, fitted)
             if saturation is None:
                 saturation = sources[0].keyword("SATURATE") if "SATURATE" in header else np.inf
             camera = {"saturation": saturation, "bunit": str(header.get("BUNIT", ""))}
             return Calibration.of(reduce_frames(registered, optics), **self.kept, **camera)
         except ValueError as error:  # any of the files can be the cause
-            raise ValueError(f"{error} (files: {', '.join(source.name for source in sources)})") from error
+            names = ", ".join(source.name for source in sources)
+            two = [source.name for source in sources[: len(frames) + len(pupils)] if source.n_exposures == 2]
+            hint = f"; n_images = 2 takes the two exposures of {two[0]} for two images" if two else ""
+            raise ValueError(f"{error} (files: {names}{hint})") from error
 
     def commanded(self, commands: Path, **camera: Any) -> Calibration:
         """Calibration with a fit of the bench, or without where the fit measures an unseen state no better."""

@@ -37,6 +37,7 @@ from zwfs.sensor import ZernikeSensor
 
 EXPLAINED = 1.2
 """Mean square of the residuals over the noise up to which a model explains the frames."""
+_WEAK = 0.02  # radian rms, of commands: weaker ones hardly tell properties of the bench from errors of its model
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _PHASE_PRIOR = MapPrior(0.5, 3.0)
 _LEAST_FOCUS = 2e-4  # D^2 / lambda, where a fit starts with another sign of the focus
@@ -510,6 +511,9 @@ def _remarks(
     out = []
     if is_reversed:
         out.append("The images are in reverse order: the first image has the second of the phase shifts given.")
+    strength = float(np.std(data.phases - data.phases.mean(axis=0)))
+    if strength < _WEAK:
+        out.append(f"The commands change the phase by {strength:.2g} rad rms: expected {_WEAK:g} or more.")
     for estimate, free in zip(estimates, point.problem.free, strict=True):
         if estimate.at_limit and not (free.name in _PHYSICAL and estimate.value <= free.low):
             out.append(f"{estimate.name} stands at a limit of the fit.")

@@ -11,6 +11,7 @@ import hashlib
 import io
 import json
 import math
+import warnings
 import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -38,7 +39,7 @@ from zwfs.frames._prediction import Prediction
 from zwfs.frames._solver import MapPrior
 from zwfs.frames.controller import Controller, PhaseController, make_controller
 from zwfs.frames.phases import Flag, Phases
-from zwfs.frames.pipeline import Measurement, Optics, ideal_frames, measured
+from zwfs.frames.pipeline import Measurement, Optics, doubt, ideal_frames, measured
 from zwfs.frames.registration import FRAMES
 from zwfs.metrics import without_piston
 from zwfs.reconstructors.base import Reconstructor
@@ -211,7 +212,8 @@ class Calibration(Immutable):
             With commands, called with a short text before each step of the fit.
         **settings
             Of `zwfs.frames.registration.register_frames`: pupil_centers, pupil_diameter, exposure, subpixel. With
-            commands only the first two.
+            commands only the first two. By default the exposure is the ratio of the times that the headers state,
+            see `zwfs.frames.files.read_all`, or 1.
 
         Raises
         ------
@@ -253,7 +255,8 @@ class Calibration(Immutable):
     @classmethod
     def from_arrays(
         cls, frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, *,
-        saturation: float = np.inf, n_iterations: int = 25, tolerance: float = 1e-3, **optics: Any,
+        saturation: float = np.inf, exposure: float = 1.0, n_iterations: int = 25, tolerance: float = 1e-3,
+        **optics: Any,
     ) -> Calibration:  # fmt: skip
         """Calibration from a pair of frames as those to come, and from clear frames.
 
@@ -261,11 +264,14 @@ class Calibration(Immutable):
         ----------
         frames, clear_frames : array_like, shape (ny, nx) or (2, ny, nx), counts
             One camera image with both pupils, or one for each: with the mask in, and with the mask out. With one
-            phase shift, one image with one pupil. NaN marks bad pixels. Average several exposures first.
+            phase shift, one image with one pupil. NaN, or the mask of a masked array, marks bad pixels. Average
+            several exposures first.
         dark : array_like, shape (ny, nx) or (2, ny, nx), counts, optional
             Counts without light, which are subtracted from both, and from the frames to come.
         saturation, n_iterations, tolerance : float, counts; int; float, radian
-            Attributes of the calibration.
+            Attributes of the calibration. Pixels that reach the saturation are bad, the dark included.
+        exposure : float
+            Exposure of the frames over that of the clear frames.
         **optics
             Parameters of `Optics`, such as `diameter` and `phase_shifts`, or `masks`.
 
@@ -275,7 +281,8 @@ class Calibration(Immutable):
             If a shape is wrong, or the pupils are not found.
         """
         attributes = {"saturation": saturation, "n_iterations": n_iterations, "tolerance": tolerance}
-        return cls.of(measured(frames, clear_frames, dark, Optics(**optics)), **attributes)
+        measurement = measured(frames, clear_frames, dark, Optics(**optics), saturation, exposure)
+        return cls.of(measurement, **attributes)
 
     @classmethod
     def fit(
@@ -340,7 +347,8 @@ class Calibration(Immutable):
         Parameters
         ----------
         measurement : Measurement
-            Of frames that are taken as those to come, and of clear frames. Its images know the dark.
+            Of frames that are taken as those to come, and of clear frames. Its images know the dark. If no phase
+            explains them, there is a warning.
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
         """
@@ -368,6 +376,8 @@ class Calibration(Immutable):
         errors = sideways(calibration.sensor, phase[0], frames[0], good)[np.newaxis]
         shift = calibration._work.displaced(phase, frames, good[np.newaxis])[0]
         residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
+        if remark := doubt(measurement, phase[0]):
+            warnings.warn(remark, stacklevel=3)
         return replace(
             calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
             residual=float(residual[0]), light_ratio=float(ratio[0]),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import math
 import os
+import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -34,11 +35,14 @@ __all__ = ["CameraFile", "check_output", "read", "read_all", "write_phase"]
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
 _PIECE = 2**22  # pixels of exposures that are read at once
 _POSITIVE = ("WAVELEN", "DIMPLE", "EGAIN", "SATURATE")  # keywords whose value is above 0
-# Keywords of the exposure time and of the window on the detector, and the relative difference that is none.
-_SETTINGS = ("EXPTIME", "EXPOSURE", "ESO DET DIT", "ESO DET SEQ1 DIT", "DETSEC", "CCDSEC", "SUBRECT", "XORGSUBF",
-             "YORGSUBF", "XSTART", "YSTART", "ESO DET WIN1 STRX", "ESO DET WIN1 STRY", "ESO DET WIN STARTX",
-             "ESO DET WIN STARTY")  # fmt: skip
-_SAME = 0.01
+# Keywords of the exposure time, and of the window on the detector: its ends, or where its rows and columns begin.
+_TIMES = "EXPTIME", "EXPOSURE", "ITIME", "TINT", "ESO DET DIT", "ESO DET SEQ1 DIT"
+_ENDS = "DETSEC", "CCDSEC", "SUBRECT"
+_STARTS = (("YORGSUBF", "XORGSUBF"), ("YSTART", "XSTART"), ("ESO DET WIN1 STRY", "ESO DET WIN1 STRX"),
+           ("ESO DET WIN STARTY", "ESO DET WIN STARTX"))  # fmt: skip
+_WINDOWS = *_ENDS, *sum(_STARTS, ())
+_PER_SECOND = "/s", "/sec", "s-1", "s^-1", "s**-1"  # ends of units
+_SAME = 0.01  # relative difference of exposure times that is none
 _ALIKE = 5.0  # median absolute deviations by which two darks may differ
 # Header card of a phase map: no other file is replaced.
 _PHASE_CARD = b"CREATOR = 'zwfs "
@@ -179,8 +183,9 @@ def read_all(
     (n, 2, ny, nx). Two units of a FITS file are the two images of an exposure, and so are two files. Three files
     or more are exposures. An array (2, ny, nx) holds two exposures; for the two images of one, set ``n_images=2``.
 
-    A dark or a map belongs to the frames of its shape. Of several darks, a frame gets those with the same exposure
-    time and window, where the headers state them (EXPTIME, EXPOSURE, DETSEC, CCDSEC, SUBRECT, XORGSUBF, ...).
+    A dark or a map belongs to the frames of its shape. If headers state windows on the detector (DETSEC, CCDSEC,
+    SUBRECT, XORGSUBF, ...), it also belongs to the frames whose window it contains. Of several darks, a frame gets
+    those with the same window and exposure time (EXPTIME, EXPOSURE, ...).
 
     Bad are pixels that are NaN, infinite or beyond 1e38, are not 0 in a map, or are saturated in one exposure.
 
@@ -225,10 +230,11 @@ def read_all(
     shapes = {file.images.shape[1:] for file in (*frames, *clear)}
     for name, files in zip(names[2:], (darks, maps, pupil_darks), strict=True):
         for file in files:
-            if file.images.shape[1:] not in shapes:
+            if not any(_on_window(file, frame) for frame in (*frames, *clear)):
                 expected = " or ".join(map(str, sorted(shapes)))
                 raise ValueError(
-                    f"{name}: {file.name} has shape {file.images.shape[1:]}: expected {expected}, as the frames"
+                    f"{name}: {file.name} has shape {file.images.shape[1:]}: expected {expected}, as the frames, "
+                    "or headers with DETSEC that state where their windows lie"
                 )
     return (
         combined(frames, darks, maps, n_images),
@@ -258,7 +264,7 @@ def combined(
             names = _names([*sources, *darks, *bad_pixels])
             raise ValueError(f"{names}: all pixels are bad or saturated: expected an image")
         name = _names(sources) + f"[{index}]" * (len(files[0].images) > 1)
-        result.append(Image(nearest_good(counts, ~bad), bad, name, dark=dark))
+        result.append(Image(nearest_good(counts, ~bad), bad, name, dark=dark, window=_window(sources[0])))
     return tuple(result)
 
 
@@ -492,7 +498,7 @@ def _companion(
     if not files:
         return np.zeros(())
     shape, first_shape = frame.images.shape[1:], files[0].images.shape[1:]
-    same = [file for file in files if file.images.shape[1:] == shape]
+    same = [part for file in files if (part := _on_window(file, frame))]
     if not same:
         raise ValueError(
             f"{argument}: {_names(files)} has shape {first_shape}: expected {shape}, that of {frame.name}"
@@ -529,9 +535,50 @@ def _check_alike(darks: Sequence[CameraFile]) -> None:
             )
 
 
+def _window(file: CameraFile) -> tuple[int, int] | None:
+    """First row and column of the images on the detector, as the header states them, counted from any number."""
+    for key in _ENDS:
+        numbers = [int(number) for number in re.findall("[0-9]{1,6}", str(file.header.get(key, "")))]
+        if len(numbers) == 4:
+            (left, right), (top, bottom) = sorted(numbers[:2]), sorted(numbers[2:])
+            if (bottom - top + 1, right - left + 1) == file.images.shape[1:]:  # not so where pixels are binned
+                return top, left
+    for keys in _STARTS:
+        starts: list[Any] = [file.header.get(key) for key in keys]
+        if all(isinstance(start, int | float) and float(start).is_integer() for start in starts):
+            return int(starts[0]), int(starts[1])
+    return None
+
+
+def _on_window(file: CameraFile, frame: CameraFile) -> CameraFile | None:
+    """The part of a dark or a map on the window of a frame; all of it if it has this shape."""
+    shape = frame.images.shape[1:]
+    if file.images.shape[1:] == shape:
+        return file
+    own, window = _window(file), _window(frame)
+    if own is None or window is None or window[0] < own[0] or window[1] < own[1]:
+        return None
+    row, column = window[0] - own[0], window[1] - own[1]
+    images = file.images[:, row : row + shape[0], column : column + shape[1]]
+    cards = {key: frame.header[key] for key in _WINDOWS if key in frame.header}
+    return replace(file, images=images, header={**file.header, **cards}) if images.shape[1:] == shape else None
+
+
+def relative_exposure(frame: CameraFile, clear_frame: CameraFile) -> float:
+    """Exposure time of a frame over that of a clear frame; 1 where headers state none, or count per second."""
+    headers = frame.header, clear_frame.header
+    if any(str(header.get("BUNIT", "")).strip().lower().endswith(_PER_SECOND) for header in headers):
+        return 1.0
+    for key in _TIMES:
+        time, clear_time = (header.get(key, 0) for header in headers)
+        if all(isinstance(value, int | float) and 0 < value < np.inf for value in (time, clear_time)):
+            return float(time / clear_time)
+    return 1.0
+
+
 def _difference(dark: CameraFile, frame: CameraFile) -> str:
     """Exposure time or window in which a dark differs from a frame, where both headers state it."""
-    for key in _SETTINGS:
+    for key in (*_TIMES, *_WINDOWS):
         if key in dark.header and key in frame.header:
             values = dark.header[key], frame.header[key]
             numbers = all(isinstance(value, int | float) for value in values)

@@ -43,6 +43,8 @@ _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly l
 _HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
 _DEGREE = 4  # of the polynomials that describe how unlike the two arms are
 _CERTAIN = 3.0  # standard errors: less of a difference between the arms is noise
+_DOUBTFUL, _UNLIKE = 0.08, 4.0  # of the light, and of the noise of the frames: a larger residual is worth a word
+_SECOND = 1.0, -2.0, 1.0  # a smooth phase hardly changes the second differences
 MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
 
 
@@ -297,12 +299,15 @@ class Agreement:
         return frames[(..., *self.measurement.window)][:, self.measurement.good]
 
 
-def phase_of(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, **optics: Any) -> Phases:
+def phase_of(
+    frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None = None, *,
+    saturation: float = np.inf, exposure: float = 1.0, **optics: Any,
+) -> Phases:  # fmt: skip
     """Phase of a pair of camera frames, for a first look.
 
     Parameters
     ----------
-    frames, clear_frames, dark, **optics
+    frames, clear_frames, dark, saturation, exposure, **optics
         As for `zwfs.frames.Calibration.from_arrays`, whose calibration is called on the same frames.
 
     Returns
@@ -320,8 +325,8 @@ def phase_of(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None 
     """
     from zwfs.frames.calibration import Calibration  # late: it needs this module
 
-    measurement = measured(frames, clear_frames, dark, Optics(**optics))
-    return replace(Calibration.of(measurement)(frames), measurement=measurement)
+    measurement = measured(frames, clear_frames, dark, Optics(**optics), saturation, exposure)
+    return replace(Calibration.of(measurement, saturation=saturation)(frames), measurement=measurement)
 
 
 def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: float = 1e-3) -> Phases:
@@ -351,18 +356,25 @@ def recover_phase(measurement: Measurement, n_iterations: int = 25, tolerance: f
     return replace(calibration(counts if len(counts) == 2 else counts[0]), measurement=measurement)
 
 
-def measured(frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None, optics: Optics) -> Measurement:
+def measured(
+    frames: ArrayLike, clear_frames: ArrayLike, dark: ArrayLike | None, optics: Optics,
+    saturation: float = np.inf, exposure: float = 1.0,
+) -> Measurement:  # fmt: skip
     """Measurement from arrays, see `zwfs.frames.Calibration.from_arrays`."""
+    saturation = _check.number_or_inf("saturation", saturation, open_low=True)
     unlit, pair = 0 if dark is None else _check.real_array("dark", dark), []
     for name, counts in (("frames", frames), ("clear_frames", clear_frames)):
         images = _check.real_array(name, counts)
+        images = np.where(images >= saturation, np.nan, images)
         if images.ndim not in (2, 3) or images.shape[:-2] not in ((), (2,)):
-            raise ValueError(f"{name} has shape {images.shape}: expected (ny, nx), or (2, ny, nx) for two images")
+            expected = "(ny, nx), or (2, ny, nx) for two images; average several exposures first"
+            raise ValueError(f"{name} has shape {images.shape}: expected {expected}")
         if np.shape(unlit) not in ((), images.shape[-2:], images.shape):
             raise ValueError(f"dark has shape {np.shape(unlit)}: expected {images.shape}, that of {name}")
         maps = np.stack(np.broadcast_arrays(images - unlit, unlit)).reshape(2, -1, *images.shape[-2:])
         pair.append([Image.of(counts, name, lightless) for counts, lightless in zip(*maps, strict=True)])
-    return reduce_frames(register_frames(*pair, n_pupils=len(optics.phase_shifts)), optics)
+    registered = register_frames(*pair, n_pupils=len(optics.phase_shifts), exposure=exposure)
+    return reduce_frames(registered, optics)
 
 
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:
@@ -589,6 +601,25 @@ def upside_down(measurement: Measurement) -> Measurement:
     maps = measurement.intensity, measurement.bad, measurement.gain
     intensity, bad, gain = (np.stack([first, second[::-1]]) for first, second in maps)
     return replace(measurement, intensity=intensity, bad=bad, gain=gain)
+
+
+def doubt(measurement: Measurement, phase: NDArray) -> str:
+    """Say that frames do not belong to their model with a phase (ny, nx); empty if they do, off the edges."""
+    agreement, far = measurement.agreement(phase), measurement.good & ~near_edges(measurement)
+    if not far.any():
+        return ""
+    measured, modelled = (
+        frames[(..., *measurement.window)] for frames in (agreement.measured, agreement.modelled)
+    )
+    residual = float(np.sqrt(np.mean((measured - modelled)[:, far] ** 2)))
+    rough = [ndimage.convolve(frame, np.outer(_SECOND, _SECOND) / 6, mode="nearest") for frame in measured]
+    noise = 1.48 * np.median(np.abs(rough)[:, far])
+    if residual < max(_DOUBTFUL, _UNLIKE * noise):
+        return ""
+    return (
+        f"The frames differ from their model by {residual:.2g} of the mean light, and noise explains {noise:.2g}: "
+        "look at exposure, dark, the order and the orientation of the images, and bad pixels."
+    )
 
 
 def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:

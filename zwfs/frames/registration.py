@@ -23,6 +23,8 @@ from zwfs.frames._outline import Circle, Details, outline, threshold
 __all__ = ["Placement", "RegisteredFrames", "register_frames"]
 
 _REACH = 6  # pixels by which an image may be off its neighbour before sub-pixel registration
+_GAPS = 6, 2  # half of the pixels by which parts of a pupil are apart; less where two pupils are as close
+_MANY_BAD = 0.05  # of the pixels of an image: worth a word where no pupil is found
 _SMALLEST = 8  # pixels across a pupil: with fewer there is no outline
 _MARGIN = 0.25  # of the diameter: more of the dark surroundings adds nothing
 _TOUCHED = 0.01  # weight of a bad pixel from which on a point is bad
@@ -35,10 +37,13 @@ _EDGE, _AROUND = 3, 8  # pixels around the pupil: those that take part where the
 # A pixel beyond all neighbours but one, by so many times their spread and noise: on frame and clear frame, on one.
 _ODD_ON_BOTH, _ODD = 0.5, 3.0
 _FAINT = 0.01  # of the brightest light: a pixel that is off by less does no harm
+_BRIGHTER = 1.5  # light of hot pixels that stand together over that of a pupil
+_UNLIT, _MOST_OF_IT = 0.05, 0.6  # light of a dead line over that around it, and part of a hot line that is hot
+_FEW_LINES = 4
 # Why an image holds one pupil, or two.
 _WHY = {
     1: "because another image holds the other pupil, or phase_shifts has one value",
-    2: "because two images are needed, with different phase shifts",
+    2: "because two images are needed, with different phase shifts, and some pixels apart",
 }
 FRAMES, CLEAR_FRAMES = slice(0, 2), slice(2, 4)  # of the four images
 _LARGEST_TURN, _LARGEST_STRETCH = 6.0, 0.06  # degrees, and relative, of the second image
@@ -60,6 +65,8 @@ class Image:
         Whether the surroundings of the pupil were set to 0 by software, so that they do not show the background.
     dark : ndarray, shape (ny, nx), or float
         Counts without light, which were subtracted; NaN where they are not known.
+    window : (int, int), optional
+        First row and column of the image on the detector, where they are known; counted from any number.
 
     Raises
     ------
@@ -72,6 +79,7 @@ class Image:
     name: str = "image"
     cut: bool = False
     dark: NDArray[np.float64] | float = 0.0
+    window: tuple[int, int] | None = None
 
     def __post_init__(self) -> None:
         counts = _check.real_map("counts", self.counts, 2)
@@ -88,6 +96,8 @@ class Image:
     def of(cls, counts: NDArray, name: str, dark: Any = 0.0) -> Image:
         """Image of counts, (ny, nx), less the dark, in which bad pixels are not finite."""
         good = np.isfinite(counts)
+        if not good.any():
+            raise ValueError(f"{name} less the dark: all pixels are NaN or infinite: expected an image")
         return cls(nearest_good(counts, good), ~good, name, dark=dark)
 
 
@@ -259,10 +269,11 @@ def register_frames(
 ) -> RegisteredFrames:
     """Find the pupils on the images and register these to each other.
 
-    The second clear frame is registered to the first. Frames of the same format as the clear frames are taken to
-    stand at the same place: the camera has not moved. If they are of another format, the pupils are located on
-    them, too, and each is registered to its clear frame. That is less reliable, because the phase changes the look
-    of gaps and edges.
+    The second clear frame is registered to the first. Frames are taken to stand at the same place of the detector
+    as the clear frames: the camera has not moved. If they are of another format and the windows of both on the
+    detector are not known, the pupils are located on them, too. Where one image holds both pupils, both have moved
+    by the same number of whole pixels. Otherwise each frame is registered to its clear frame. That is less
+    reliable, because the phase changes the look of gaps and edges.
 
     Hot and dead pixels that are not yet marked as bad are found and marked: they are brighter or darker than all
     their neighbours but one, by much on one image or by less on frame and clear frame alike.
@@ -301,7 +312,10 @@ def register_frames(
             raise ValueError(f"{name} holds {len(images)} images: expected 1{' or 2' * (n_pupils == 2)}")
     n_marked = _n_bad(*frames, *clear_frames)
     # The clear frames are judged alone, so that a pupil stands at the same place for all frames.
-    frames, clear_frames = _without_odd(frames, clear_frames), _without_odd(clear_frames)
+    frames, clear_frames = (
+        _without_odd(frames, clear_frames, clear=False),
+        _without_odd(clear_frames, frames, clear=True),
+    )
     n_odd = _n_bad(*frames, *clear_frames) - n_marked
     if n_pupils == 1:
         frames, clear_frames = frames * 2, clear_frames * 2
@@ -314,14 +328,19 @@ def register_frames(
     _check_alike(clear, pupils)
     masked, circles = (frames[0], frames[-1]), pupils
     formats = [(pair[0] is pair[1], *(image.counts.shape for image in pair)) for pair in (masked, clear)]
-    moved = formats[0] != formats[1]
-    if moved:
-        masked, circles = _locate(frames, None, diameter or pupils[0].diameter)
+    windows = [[image.window or () for image in pair] for pair in (masked, clear)]
+    stated = all(image.window for image in (*masked, *clear))
+    moved = formats[0] != formats[1] and not stated
+    if moved or (stated and windows[0] != windows[1]):
+        centers = np.array([circle[:2] for circle in pupils]) + windows[1] - windows[0] if stated else None
+        masked, circles = _locate(frames, centers, diameter or pupils[0].diameter)
     for image in masked:
         if not np.ptp(image.counts) > 0:
             raise ValueError(f"{image.name}: every pixel is {image.counts.flat[0]:.6g}: expected light")
     places = np.array([circle[:2] for circle in (*circles, *pupils)])
     origins = np.round(places - places[2])
+    if moved and masked[0] is masked[1] and clear[0] is clear[1]:
+        origins[:2] = origins[2:] + np.mean(places[:2] - places[2:], axis=0)
     rough = RegisteredFrames(masked, clear, pupils, origins, background, balance, exposure, n_odd=n_odd)
     return _register(rough, frames_too=moved) if subpixel else rough
 
@@ -358,26 +377,35 @@ def find_pupils(image: Image, n_pupils: int, diameter: float | None = None) -> l
     diameter, in pixels, may be given.
     """
     smooth = ndimage.gaussian_filter(image.counts, 1.0)
-    remark = ""
-    if image.bad.mean() > 0.5:
-        remark = f" ({image.bad.mean():.4g} of its pixels are marked as bad: expected a map that is 0 where good)"
+    remark = _on_bad(image)
     if np.ptp(smooth) <= 1e-9 * np.abs(smooth).max(initial=1e-300):
         raise ValueError(f"{image.name}: every pixel is {smooth.flat[0]:.6g}: expected light in a pupil{remark}")
-    level = threshold(smooth)
-    bright = ndimage.binary_opening(smooth > level, iterations=2)
-    # Gaps between segments, and vanes, divide a pupil.
-    bright = ndimage.binary_closing(np.pad(bright, 8), iterations=6)[8:-8, 8:-8]
-    labels, n_found = ndimage.label(bright)
-    areas = np.asarray(ndimage.sum_labels(bright, labels, np.arange(1, n_found + 1)))
-    largest = np.flatnonzero((areas > 0.25 * areas.max(initial=0)) & (areas.max(initial=0) >= 50)) + 1
-    if len(largest) != n_pupils:
+    level, numbers = threshold(smooth), list[int]()
+    bright = np.pad(ndimage.binary_opening(smooth > level, iterations=2), 8)
+    for n_closed in _GAPS:
+        labels, n_found = ndimage.label(ndimage.binary_closing(bright, iterations=n_closed)[8:-8, 8:-8])
+        areas = ndimage.sum_labels(labels > 0, labels, np.arange(1, n_found + 1))
+        largest = np.flatnonzero((areas > 0.25 * areas.max(initial=0)) & (areas.max(initial=0) >= 50)) + 1
+        numbers.append(len(largest))
+        if len(largest) == n_pupils:
+            break
+    else:
         raise ValueError(
-            f"{image.name}: {len(largest)} bright regions as large as a pupil: expected {n_pupils}, "
+            f"{image.name}: {numbers[0]} bright regions as large as a pupil: expected {n_pupils}, "
             f"{_WHY[n_pupils]}; give the positions, or look for stray light{remark}"
         )
     circles = [outline(smooth, labels == label, level, diameter) for label in largest]
     axis = int(np.argmax(np.ptp([circle[:2] for circle in circles], axis=0)))
     return sorted(circles, key=lambda circle: circle[axis])
+
+
+def _on_bad(image: Image) -> str:
+    """Remark for a message on an image with many bad pixels."""
+    share = image.bad.mean()
+    if share <= _MANY_BAD:
+        return ""
+    expected = "a map that is 0 where good, and a saturation above the light"
+    return f" ({share:.0%} of its pixels are marked as bad: expected {expected})"
 
 
 def register(
@@ -394,7 +422,8 @@ def register(
     Maximises the correlation of the two at the points `inside` the reference, after a band-pass that keeps gaps,
     vanes and edges but takes away noise, the illumination, and the grid of a deformable mirror, whose contrast
     depends on the focus of the camera. With `turn`, a rotation or magnification that the images do not determine
-    stays out: its standard error exceeds 0.05 pixels at the edge of `inside` and a tenth of its value.
+    stays out: its standard error exceeds 0.05 pixels at the edge of `inside`, and a tenth of its value unless that
+    is larger than allowed.
     """
     center = center or ((len(reference) - 1) / 2, (len(reference[0]) - 1) / 2)
     # Details of three times the width, at every third point, draw the search from farther away.
@@ -408,13 +437,19 @@ def register(
     start = min(moves, key=lambda move: float(np.sum(coarse.difference(move) ** 2)))
     if max(map(abs, start[:2])) == _REACH:
         reason = f"the best shift of the images is {start[:2]} pixels, the end of the search"
-        raise ValueError(f"{reason}: expected less than {_REACH}")
+        raise ValueError(f"{reason}: expected less than {_REACH}, and images that look alike")
     turns = np.array([False, False, True, True])
     free = turn | ~turns
     best, _ = coarse.search(np.array(start), free)
     best, sigma = details.search(best, free)
-    while (unsure := turns & free & ~(sigma < np.maximum(_SURE, _SIGNIFICANT * np.abs(best)))).any():
-        worst = np.argmax(np.where(unsure, np.nan_to_num(sigma, nan=np.inf), -1))
+    most = details.reach * np.array([np.inf, np.inf, np.radians(_LARGEST_TURN), _LARGEST_STRETCH])
+
+    def unsure() -> NDArray[np.bool_]:
+        significant = np.where(np.abs(best) < most, _SIGNIFICANT * np.abs(best), 0)
+        return turns & free & ~(sigma < np.maximum(_SURE, significant))
+
+    while (unsure_values := unsure()).any():
+        worst = np.argmax(np.where(unsure_values, np.nan_to_num(sigma, nan=np.inf), -1))
         free[worst], best[worst] = False, 0
         best, sigma = details.search(best, free)
     scale = np.array([1, 1, np.degrees(1 / details.reach), 1 / details.reach])
@@ -447,7 +482,7 @@ def _locate(
             raise ValueError(
                 f"{image.name}: the pupil {origin}at row {circle.row:.1f}, column {circle.column:.1f}, "
                 f"{circle.diameter:.1f} pixels wide, is cut off at the {side} (row 0 is the top): "
-                "expected all of it on the image"
+                f"expected all of it on the image{_on_bad(image)}"
             )
     first = _extend(pair[0], circles if shared else circles[:1])
     return (first, first if shared else _extend(pair[1], circles[1:])), (circles[0], circles[1])
@@ -457,15 +492,23 @@ def _n_bad(*images: Image) -> int:
     return sum(int(np.count_nonzero(image.bad)) for image in images)
 
 
-def _without_odd(images: Sequence[Image], others: Sequence[Image] = ()) -> tuple[Image, ...]:
-    """Images with hot and dead pixels marked as bad; `others` show the same pixels without or with the mask."""
-    shapes = [[image.counts.shape for image in pair] for pair in (images, others)]
+def _without_odd(images: Sequence[Image], others: Sequence[Image], *, clear: bool) -> tuple[Image, ...]:
+    """Images with hot and dead pixels and lines marked as bad; `others` show them without or with the mask.
+
+    A group of bright pixels may be a poke on a frame, but is hot on a clear frame. A line without light may be a
+    vane on a clear frame, but is dead on a frame, where the mask sends light into it.
+    """
+    alike = [image.counts.shape for image in images] == [image.counts.shape for image in others]
     marked = []
     for index, image in enumerate(images):
-        sizes = _outstanding(image)
-        odd = sizes.max(axis=0) > _ODD
-        if shapes[0] == shapes[1]:
+        sizes, (hot, dead) = _outstanding(image), _lines(image)
+        odd = (sizes.max(axis=0) > _ODD) | hot
+        if alike and clear:
+            odd |= _groups(image) | (dead & _lines(others[index])[1])
+        elif alike:
             odd |= (np.minimum(sizes, _outstanding(others[index])) > _ODD_ON_BOTH).any(axis=0)
+            odd |= _groups(others[index])
+        odd |= dead & (not clear)
         bad = image.bad | odd
         marked.append(replace(image, counts=nearest_good(image.counts, ~bad), bad=bad) if odd.any() else image)
     return tuple(marked)
@@ -478,6 +521,40 @@ def _outstanding(image: Image) -> NDArray[np.float64]:
     low, middle, high = (ndimage.rank_filter(counts, rank, footprint=ring) for rank in (1, 4, -2))
     unit = high - low + ndimage.uniform_filter(np.abs(counts - middle), 7) + _FAINT * np.ptp(middle)
     return np.array([counts - high, low - counts]) / np.maximum(unit, 1e-300)
+
+
+def _groups(image: Image) -> NDArray[np.bool_]:
+    """Pixels of groups of a few that are brighter than those around them, and than the light of a pupil."""
+    counts, light = _above_dark(image)
+    ring = np.pad(np.zeros((3, 3)), 1, constant_values=1)
+    return (counts > _BRIGHTER * light) & (counts - ndimage.rank_filter(counts, -4, footprint=ring) > light / 2)
+
+
+def _lines(image: Image) -> NDArray[np.bool_]:
+    """Pixels of lines that are brighter than those around them, and of lines without light, (2, ny, nx).
+
+    Many lines are the gaps of a mirror of segments, and not faults of a camera.
+    """
+    counts, light = _above_dark(image)
+    odd = np.zeros((2, *counts.shape), bool)
+    for axis in (0, 1):
+        lines = np.moveaxis(counts, axis, 0)
+        sides = [np.roll(lines, step, axis=0) for step in (-3, -2, 2, 3)]
+        lowest, highest = np.min(sides, axis=0), np.max(sides, axis=0)
+        lit = lowest > light / 2
+        hot = np.mean(lines - highest > light / 2, axis=1) > _MOST_OF_IT
+        dead = np.sum(lines, axis=1, where=lit) < _UNLIT * np.sum(lowest, axis=1, where=lit)
+        for which, index in ((hot, 0), (dead & (np.count_nonzero(lit, axis=1) >= _SMALLEST), 1)):
+            if np.count_nonzero(which) <= _FEW_LINES:
+                np.moveaxis(odd[index], axis, 0)[which] = True
+    return odd
+
+
+def _above_dark(image: Image) -> tuple[NDArray[np.float64], float]:
+    """Counts above those of dark pixels, and those of a typical lit one."""
+    lit = image.counts > threshold(image.counts)
+    dark, light = (float(np.median(image.counts[which])) if which.any() else 0.0 for which in (~lit, lit))
+    return image.counts - dark, light - dark
 
 
 def _extend(image: Image, circles: Sequence[Circle]) -> Image:
@@ -511,6 +588,13 @@ def _register(rough: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
     if not frames_too:
         return placed
     (frames, _), (images, _) = (placed._on_grid(which) for which in (FRAMES, CLEAR_FRAMES))
+    if placed.frames[0] is placed.frames[1] and placed.clear_frames[0] is placed.clear_frames[1]:
+        # What opposite phase shifts change at the edge of the pupil, and in it, is smaller in the mean.
+        inside = radius(images.shape[1:], placed.center) <= placed.diameter / 2 + _EDGE
+        move = register(frames.mean(axis=0), images.mean(axis=0), inside, placed.center).shift
+        # The outlines err in other ways than the content, so that their mean is better than each.
+        origins[:2] = origins[2:] + np.round(origins[0] - origins[2] + move / 2)
+        return replace(placed, origins=origins)
     # Off the edge, which the mask makes bright or dark.
     inside = radius(images.shape[1:], placed.center) <= 0.45 * placed.diameter
     moves = [

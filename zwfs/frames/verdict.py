@@ -44,6 +44,8 @@ _STRONGER = 1.5  # times the weakest phase that is possible: the scale of the ph
 _UNEVEN = 0.03  # difference of the two flux ratios that is worth a word
 _EXCESS = 0.02  # light around the pupil, 1 = mean of the pupil, that is worth a word
 _MANY = 0.01  # of the points
+_MOST_LIGHT = 1.1  # in the pupil, 1 = that of the clear frames
+_FEW, _MOST = 0.02, 0.9  # part of the points that is worth a word if it holds most of the squared misfit
 _TURNED = 5.0  # standard errors: a rotation or magnification beyond them is real
 _ONE_IMAGE = (
     "Not decided: one image fits nearly any phase. It cannot show whether the phase is on the right branch of the "
@@ -185,7 +187,7 @@ def judge(phases: Phases, noise: CameraNoise | None = None, n_iterations: int = 
             "light": _of_light(measurement),
             "registration": _of_place(measurement.registered.placement),
         }
-    if warnings := " ".join(_warnings(agreement, phases)):
+    if warnings := " ".join(_warnings(agreement, phases, near)):
         findings["warnings"] = warnings
     return Verdict(score, control, inner, edge, sigma, placed, scales, strengths, findings)
 
@@ -342,8 +344,8 @@ def _of_place(placement: Placement) -> str:
     return "The second image, compared with the first: " + "; ".join(facts) + "."
 
 
-def _warnings(agreement: Agreement, phases: Phases) -> list[str]:
-    """Facts that lower the trust in the phase."""
+def _warnings(agreement: Agreement, phases: Phases, near: NDArray[np.bool_]) -> list[str]:
+    """Facts that lower the trust in the phase; `near` are the points near edges."""
     measurement, remarks = agreement.measurement, []
     n_points = measurement.pupil.n_points
     if not phases.converged:
@@ -352,6 +354,20 @@ def _warnings(agreement: Agreement, phases: Phases) -> list[str]:
         remarks.append(f"At {phases.n_unsolved} of {n_points} points the equations have no unique solution.")
     if measurement.n_bad > _MANY * n_points:
         remarks.append(f"{measurement.n_bad} of {n_points} points are bad and have no phase.")
+    light = float(np.mean(agreement.measured[(..., *measurement.window)][:, measurement.good]))
+    if light > _MOST_LIGHT:
+        remarks.append(
+            f"The pupil holds {light:.2f} times the light of the clear frames, and a mask makes no light: look at "
+            "the exposures and the dark."
+        )
+    missing = (agreement.measured - agreement.modelled)[(..., *measurement.window)][:, measurement.good & ~near]
+    squares = np.sort(np.sum(missing**2, axis=0))
+    share = squares[squares.size - math.ceil(_FEW * squares.size) :].sum() / max(squares.sum(), 1e-300)
+    if share > _MOST:
+        remarks.append(
+            f"{_FEW:.0%} of the points far from edges hold {share:.0%} of the squared misfit there: look for "
+            "cosmic rays and bad pixels."
+        )
     if abs(agreement.excess_light) > _EXCESS:
         remarks.append(
             f"Around the pupil the frames differ from the model by {agreement.excess_light:+.3f} of the mean "

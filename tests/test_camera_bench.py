@@ -17,6 +17,7 @@ from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
+from zwfs.frames._prediction import _slopes
 from zwfs.frames._solver import fine_phase
 from zwfs.frames._states import PAD, Recording
 from zwfs.frames.phases import Flag
@@ -289,6 +290,7 @@ def test_smooth_phase_of_a_whole_camera_image_is_that_of_its_windows():
     [prior] = calibration(counts, smooth=True).priors
     estimate, expected = whole(image, smooth=prior), calibration(counts, smooth=prior)
     np.testing.assert_allclose(estimate, expected, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(whole(image), calibration(counts), rtol=0, atol=1e-4)
     assert estimate.flags == expected.flags == Flag.BAD_PIXELS
     assert not np.isnan(estimate.phase[calibration.good]).any()
     lost = whole(0 * image + np.nan, smooth=prior)
@@ -316,6 +318,51 @@ def test_smooth_phase_does_not_jump_at_gaps():
     estimate = fitted(bench)(bench.counts(screen, (7, 1)), smooth=True)
     assert estimate.priors[0].jumps == 0
     assert bench.error(estimate, screen) < 0.02
+
+
+@pytest.mark.parametrize(("rms", "share"), [(0.1, 1.0), (0.5, 0.8), (0.8, 0.7)])
+def test_call_without_a_prior_uses_all_of_the_fit(calibrated, rms, share):
+    """The linear road alone has two times the error at 0.8 rad rms."""
+    bench, calibration = calibrated
+    screens = [bench.smooth(rms, seed=seed) for seed in (31, 32)]
+    counts = np.stack([bench.counts(screen, (9, 1)) for screen in screens])
+    errors, linear = (
+        [bench.error(*pair) for pair in zip(road(counts, light=1.0), screens, strict=True)]
+        for road in (calibration, replace(calibration, bench=None))
+    )
+    assert np.linalg.norm(errors) < share * np.linalg.norm(linear)
+    assert not calibration(counts).flags.any()
+
+
+@pytest.mark.parametrize("change", [{"blur": 1.0}, {"leakage": 0.08}, {"offsets": ((0.8, -0.1), (0.45, 0.25))}])
+def test_frames_that_their_phases_do_not_predict_are_inconsistent(calibrated, change):
+    """The phase of the ideal frames alone explains some of these, which are wrong by 0.04 rad and more."""
+    bench, calibration = calibrated
+    wrong, screen = replace(bench, **change), bench.smooth(0.5, seed=21)
+    estimate = calibration(wrong.counts(screen, (7, 1)))
+    assert bench.error(estimate, screen) > 0.035
+    assert estimate.flags & Flag.INCONSISTENT
+
+
+def test_predicted_frames_move_with_the_images():
+    bench, calibration, screen = BENCH, fitted(BENCH), BENCH.smooth(0.5, seed=21)
+    moved = replace(bench, offsets=tuple((row + 1, column - 0.5) for row, column in bench.offsets))
+    estimate = calibration(moved.counts(screen, (7, 1)), follow=True)
+    np.testing.assert_allclose(estimate.displacement, (1, -0.5), rtol=0, atol=0.05)
+    assert bench.error(estimate, screen) < 0.015
+    assert not estimate.flags
+
+
+def test_jumps_and_wraps_make_no_slope():
+    phase = np.tile(np.arange(12.0)[:, np.newaxis], 2)
+    phase[6:] += 2.5
+    pairs = np.ones((11, 2), bool)
+    slopes = _slopes(np.angle(np.exp(0.3j * phase)), pairs)
+    np.testing.assert_allclose(np.delete(slopes, (5, 6), axis=0), 0.3, atol=1e-6)
+    assert np.all(np.abs(slopes) < 0.61)
+    edge = _slopes(phase, pairs & (np.arange(11) != 3)[:, np.newaxis])
+    np.testing.assert_allclose(edge[3:5], 1)  # of the only side
+    assert not _slopes(phase, ~pairs).any()
 
 
 def segments(bench, rms, width=6):

@@ -7,7 +7,7 @@ much light as there is, and modelled frames differ little from measured ones.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from zwfs.reconstructors.base import Reconstructor
 
 if TYPE_CHECKING:
     from zwfs.frames._grid import Grid
+    from zwfs.frames._prediction import Prediction
     from zwfs.frames.calibration import Calibration
 
 _DIM = 0.1  # of the light of the calibration: a frame with less is compared with its noise
@@ -26,11 +27,12 @@ _LAMP = (
     0.85,
     1.7,
 )  # light in the pupil, over that of the calibration's frames, that other phases can make of its lamp
-_UNUSUAL = 2.5  # times the residual of the calibration's frames: a larger one is inconsistent
-_EXACT = 1e-3  # residual of frames without noise
+_EXACT, _EXACT_OF_BENCH = 1e-3, 2.5e-3  # residuals of frames without noise
 MOVED_BY, SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
 _SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
-_ENOUGH = 2.25  # cost of an explanation that is good enough
+# Cost of an explanation that is good enough, and factor of the usual residual above which frames are inconsistent.
+_ENOUGH = 2.25, 2.5
+_ENOUGH_OF_BENCH = 1.96, 1.4  # where the noise is known
 _PASSES = 4  # in which the light of the modelled frames gives the next light
 _STEPS = 0.08, 0.08, 0.04, 0.02, 0.01  # relative changes of the light
 _BETTER = 0.8  # of the cost: a smaller gain moves no light
@@ -48,7 +50,8 @@ class Trial(NamedTuple):
     n_iterations: NDArray[np.int64]  # (k,)
     converged: NDArray[np.bool_]  # (k,)
     n_unsolved: NDArray[np.int64]  # (k,)
-    residual: NDArray[np.float32]  # (k,), NaN if not judged
+    residual: NDArray[np.floating]  # (k,), NaN if not judged
+    usual: NDArray[np.float64]  # (k,), of frames like those of the calibration
     ratio: NDArray[np.float64]  # (k,), light of the frames over that of their model
     cost: NDArray[np.float64]  # (k,), of both: 1 for frames like those of the calibration
 
@@ -69,12 +72,15 @@ class Exposures:
 
     def __init__(
         self, calibration: Calibration, counts: NDArray, level: float, start: NDArray | None,
-        method: Reconstructor | None, judge: bool, work: Grid | None = None,
+        method: Reconstructor | None, judge: bool, work: Grid | None = None, prediction: Prediction | None = None,
     ) -> None:  # fmt: skip
         self._of, self._work, k = calibration, work or calibration._work, len(counts)
         self._counts, self._level = counts, level
         self._start, self._method, self._judge = start, method, judge
-        values, self.good, self.n_bad, self.n_saturated = self._work.on_grid(counts, level, self._work.good)
+        self._prediction = prediction if work else calibration._prediction
+        self._enough, self._unusual = _ENOUGH_OF_BENCH if self._prediction and not method else _ENOUGH
+        self._raw, self.good, self.n_bad, self.n_saturated = self._work.cleaned(counts, level, self._work.good)
+        values = self._work.resampled(self._raw)
         self.n_good = np.maximum(np.count_nonzero(self.good, axis=(1, 2)), 1)
         sums = np.vecdot(values, self.good.reshape(k, 1, -1).astype(np.float32))
         flux = sums / (self.n_good[:, np.newaxis] * calibration.unit)
@@ -96,7 +102,9 @@ class Exposures:
         if self._method is not None and not self._method.iterative:
             start = None
         work = self._of._work.moved(self._of, shift)
-        return Exposures(self._of, self._counts[which], self._level, start, self._method, True, work)
+        prediction = self._of._prediction and self._of._prediction.moved(work, shift)
+        counts = self._counts[which]
+        return Exposures(self._of, counts, self._level, start, self._method, True, work, prediction)
 
     def residuals(self, light: NDArray) -> NDArray[np.float64]:
         """Modelled less measured frames of one exposure in the pupil, with a light; NaN at bad points."""
@@ -111,7 +119,7 @@ class Exposures:
         if light is None and self._judge:
             self._explain(trial)
         residual, displacement, moved = self._compared(trial)
-        limits = _UNUSUAL * self._usual(trial.light, self.noise) if limit is None else limit
+        limits = self._unusual * trial.usual if limit is None else limit
         flags = _BAD * (self.n_bad > 0) + _SATURATED * (self.n_saturated > 0) + INCONSISTENT * (residual > limits)
         flags += np.where(self.lit, _NOT_CONVERGED * (~trial.converged & (self._of.tolerance > 0)), _LOST)
         return Phases(
@@ -130,34 +138,45 @@ class Exposures:
     def _attempt(self, which: NDArray[np.intp], light: NDArray[np.float64]) -> Trial:
         """Phases of some exposures with a light."""
         work, good = self._work, self.good[which]
-        frames = self._ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
+        frames: Any = (
+            self._ideal[which] / light[:, np.newaxis, np.newaxis, np.newaxis].astype(np.float32) + work.offset
+        )
         frames[~self.lit[which]] = work.flat_frames  # of a flat wavefront: they converge at once
         if self._method is None:
             np.maximum(frames, 0, out=frames)
-        solved = work.solve(frames, good, None if self._start is None else self._start[which], self._method)
-        residual, ratio = np.full((2, len(which)), np.nan)
+        start, corrected = None if self._start is None else self._start[which], None
+        solved = work.solve(frames, good, start, None if self._prediction else self._method)
+        if self._prediction:
+            corrected = self._prediction.corrected(self._raw[which], light, self.lit[which], good, solved)
+            frames, solved = corrected.frames, corrected.solved
+            if self._method:
+                solved = work.solve(corrected.quiet, good, start, self._method)
+        usual, (residual, ratio) = self._usual(light, self.noise[which]), np.full((2, len(which)), np.nan)
         if self._judge:
             residual, ratio = work.compared(solved.phase, frames, good)
-        ratio, usual = ratio / self._of.light_ratio, self._usual(light, self.noise[which])
+        if self._judge and corrected and not self._method:  # counts are compared, not ideal frames
+            residual = corrected.residual
+            usual = np.maximum(corrected.noise, max(self._of.residual, _EXACT_OF_BENCH))
+        ratio = ratio / self._of.light_ratio
         unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(self.n_good[which]))
         cost = np.where(self.lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)
-        return Trial(light, solved.phase, frames, *solved[1:], residual, ratio, cost)
+        return Trial(light, solved.phase, frames, *solved[1:], residual, usual, ratio, cost)
 
     def _explain(self, best: Trial) -> None:
         """Improve the light of those exposures that their first light does not explain."""
-        poor = np.flatnonzero(best.cost > _ENOUGH)
+        poor = np.flatnonzero(best.cost > self._enough)
         for _ in range(_PASSES):
             if not poor.size:
                 return
             better = best.improved(poor, self._attempt(poor, best.light[poor] * best.ratio[poor]))
-            poor = poor[better & (best.cost[poor] > _ENOUGH)]
-        poor = np.flatnonzero(best.cost > _ENOUGH)
+            poor = poor[better & (best.cost[poor] > self._enough)]
+        poor = np.flatnonzero(best.cost > self._enough)
         for step in _STEPS:
             if not poor.size:
                 return
             for factor in (1 - step, 1 + step):
                 best.improved(poor, self._attempt(poor, best.light[poor] * factor), _BETTER)
-            poor = poor[best.cost[poor] > _ENOUGH]
+            poor = poor[best.cost[poor] > self._enough]
 
     def _compared(self, trial: Trial) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
         """Residuals, displacements, and whether an exposure has moved; NaN where it is lost or not judged."""

@@ -7,6 +7,7 @@ that are less than half a pixel away it is exact to 0.15 pixel. The rim of the p
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -53,9 +54,10 @@ def _one_followed(
     exposures: Exposures, index: int, first: Phases, light: NDArray | None, limit: float | None
 ) -> Phases:
     """Phases of an exposure, from those without a shift."""
-    phases, shift = first, np.zeros(2)
+    phases, shift, sizes = first, np.zeros(2), []
     for n_left in reversed(range(_ROUNDS + 1)):
-        missing, sigma = _remaining(exposures, index, phases, shift)
+        missing, sigma, size = _remaining(exposures, index, phases, shift)
+        sizes.append(size)
         steps = [missing] * _significant(missing, sigma) + [phases.displacement[0]]
         places = [shift + step for step in steps if np.abs(step).max() > MOVED_BY]
         places = [place for place in places if np.abs(place).max() <= _FARTHEST]
@@ -67,7 +69,7 @@ def _one_followed(
             break
         phases, shift = rivals[best], places[best]
     total, moved = shift + missing, _significant(missing, sigma)
-    if phases.residual[0] > _BETTER * first.residual[0]:
+    if sizes[-1] > _BETTER * sizes[0]:
         phases, moved = first, bool(first.flags[0] & MOVED) and _significant(total, sigma)
     flags = phases.flags & ~MOVED | MOVED * moved
     return replace(phases, displacement=total.astype(np.float32)[np.newaxis], flags=flags)
@@ -79,8 +81,8 @@ def _significant(displacement: NDArray, sigma: NDArray) -> bool:
 
 def _remaining(
     exposures: Exposures, index: int, phases: Phases, shift: NDArray
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacement of an exposure in addition to a shift, (2,), and its standard error."""
+) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
+    """Displacement of an exposure in addition to a shift, (2,), its standard error, and the rms residual."""
     changes = np.array([(0, 0), (_STEP, 0), (-_STEP, 0), (0, _STEP), (0, -_STEP)])
     residuals = np.stack(
         [exposures.moved(index, shift + change, phases.filled).residuals(phases.flux) for change in changes]
@@ -90,4 +92,5 @@ def _remaining(
     inverse = np.linalg.pinv(slopes @ slopes.T, hermitian=True)
     step = -inverse @ (slopes @ residuals[0])
     unexplained = residuals[0] + step @ slopes
-    return step, np.sqrt(np.diagonal(inverse) * np.mean(unexplained**2))
+    rms = math.sqrt(np.mean(residuals[0] ** 2))
+    return step, np.sqrt(np.diagonal(inverse) * np.mean(unexplained**2)), rms

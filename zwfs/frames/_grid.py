@@ -148,11 +148,15 @@ class Grid:
     def on_grid(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Counts on the grid, (k, 2, n), good points, (k, ny, nx), and bad and saturated pixels, (k,)."""
         raw, good, n_bad, n_saturated = self.cleaned(counts, level, good)
+        return self.resampled(raw), good, n_bad, n_saturated
+
+    def resampled(self, raw: NDArray) -> NDArray[np.float32]:
+        """Counts of the boxes, (k, 2, h, w), on the grid, (k, 2, n)."""
         coefficients = self.filters[0] @ raw @ self.filters[1].T
         values = np.stack(
             [spline @ coefficients[:, index].reshape(len(raw), -1).T for index, spline in enumerate(self.splines)]
         )
-        return np.ascontiguousarray(values.transpose(2, 0, 1)), good, n_bad, n_saturated
+        return np.ascontiguousarray(values.transpose(2, 0, 1))
 
     def cleaned(self, counts: NDArray, level: float, good: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
         """Counts of the boxes, (k, 2, h, w), less the dark and with bad pixels filled; the rest as `on_grid`."""

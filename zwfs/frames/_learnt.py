@@ -3,7 +3,7 @@
 `FittedSensor` fits each pair of frames with all of the model. Here the fit gives the places of all points and the
 blur. Weights and an offset of each point turn counts into frames of an ideal sensor: a linear fit to predicted
 frames of random phases gives them. They hold leakage, pixels that are lit in part, the rest of the blur, and the
-focus of the relay to first order.
+focus of the relay to first order. `Prediction` corrects the phases for what they miss.
 """
 
 from __future__ import annotations
@@ -39,8 +39,7 @@ def of_bench(
 ) -> Calibration:  # fmt: skip
     """Calibration of a fitted bench, from its frames, (n_states, [n_frames,] 2, ny, nx), less the dark.
 
-    The focus of the relay is corrected to first order, around a flat wavefront. By default the frames are the
-    camera images.
+    By default the frames are the camera images.
     """
     settings["n_averaged"] = counts.shape[1] if counts.ndim == 5 else 1
     counts = counts.mean(axis=1) if counts.ndim == 5 else counts
@@ -62,12 +61,9 @@ def of_bench(
     images = windows.on_camera(np.nan_to_num(counts)) + calibration.dark
     # The lamp is that of the calibration, so its light is known.
     measured = calibration(images if windows.n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
-    ideal = np.einsum("ijyx,kjyx->kiyx", weights, intensity(counts)) + offset
-    _, ratios = calibration._work.compared(measured.filled, ideal, np.broadcast_to(good, measured.phase.shape))
     return replace(
-        calibration, light_ratio=float(ratios.mean()), unexplained=unexplained(measured.phase, phases),
-        slopes=slopes_of(measured.filled, good), displacements=measured.displacement.astype(float),
-        residual=float(np.nanmax(measured.residual)),
+        calibration, unexplained=unexplained(measured.phase, phases), slopes=slopes_of(measured.filled, good),
+        displacements=measured.displacement.astype(float), residual=float(np.nanmax(measured.residual)),
     )  # fmt: skip
 
 

@@ -35,6 +35,7 @@ from zwfs.frames._fitted import WIDEST, smooth_phases
 from zwfs.frames._follow import checked_follow, followed
 from zwfs.frames._grid import Grid
 from zwfs.frames._learnt import of_bench
+from zwfs.frames._prediction import Prediction
 from zwfs.frames._solver import MapPrior
 from zwfs.frames.controller import Controller, PhaseController, make_controller
 from zwfs.frames.phases import Flag, Phases
@@ -89,7 +90,7 @@ class Calibration(Immutable):
     displacements : ndarray, shape (n_states, 2), pixels
         Rows and columns by which the rim of the pupil on the calibration's frames differs from the model.
     residual : float
-        Rms difference of the calibration's frames and their model, the largest of all states.
+        Rms difference of the calibration's frames and their model, the largest of all states, as in `Phases`.
     saturation : float, counts
         Pixels that reach it are saturated, the dark included.
     blur : float, pixels rms
@@ -293,7 +294,8 @@ class Calibration(Immutable):
         """Calibration from frames of a mirror in known states: a fit of the bench, and linear operators of it.
 
         The fit is `bench` of the result: read its `consistent` and `remarks`. The operators hold geometry, blur
-        and leakage, and the focus of the relay to first order. With `smooth`, a call uses all of the fit.
+        and leakage, and the focus of the relay to first order. A call corrects their phases twice with all of the
+        fit, which takes milliseconds. With `smooth`, it fits each exposure, in seconds.
 
         Parameters
         ----------
@@ -448,8 +450,9 @@ class Calibration(Immutable):
     ) -> Phases:  # fmt: skip
         """Phases of camera images.
 
-        With `smooth`, all of the fitted optics and a smooth prior explain each exposure, in seconds. The light is
-        taken to be that of the calibration.
+        With a `bench`, the fit predicts the frames of each phase, and what they miss corrects it. With `smooth`, a
+        smooth prior is added, and each exposure is fitted, in seconds. Then the light is taken to be that of the
+        calibration.
 
         Parameters
         ----------
@@ -464,12 +467,14 @@ class Calibration(Immutable):
             Replaces that of the calibration.
         largest_residual : float, optional
             Residual above which a frame is inconsistent. By default it is 2.5 times the residual that the frames
-            of the calibration would have with the light and the noise of this one.
+            of the calibration would have with the light and the noise of this one. With a `bench` it is 1.4 times
+            the noise of this frame, the residual of the calibration or 0.0025, whichever is largest.
         judge : bool
             Whether to compare the frames with their model. Without it residual and displacement are NaN, no frame
             is inconsistent or moved, and the light follows from the mean of the frames alone.
         method : Reconstructor, optional
-            Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``.
+            Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``. With a
+            `bench`, its frames are those of the last correction.
         smooth : bool or MapPrior
             Whether phases are taken to be smooth, for a calibration with a `bench`. True lets the evidence of each
             exposure choose the prior: the probability of the frames with all its phases. On a pupil with gaps it
@@ -665,6 +670,10 @@ class Calibration(Immutable):
     @cached_property
     def _work(self) -> Grid:
         return Grid(self)
+
+    @cached_property
+    def _prediction(self) -> Prediction | None:
+        return Prediction(self, self.bench) if self.bench else None
 
 
 def _undone(measurement: Measurement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

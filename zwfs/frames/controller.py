@@ -61,9 +61,10 @@ def make_controller(
     signals.check()
     if method != "linear":
         flat = np.where(pokes.good, pokes.flat, np.nan)
+        modes = pokes.modes(replace(calibration, bench=None)) / np.float32(poke)
         return PhaseController(
-            calibration, flat, pokes.modes(calibration) / np.float32(poke), faintest=signals.faintest, rcond=rcond,
-            gain=gain, likelihood=method == "likelihood", n_iterations=n_iterations,
+            calibration, flat, modes, faintest=signals.faintest, rcond=rcond, gain=gain,
+            likelihood=method == "likelihood", n_iterations=n_iterations,
         )  # fmt: skip
     interaction = signals.difference.T / poke
     inverse = Inverse.of(interaction, rcond, signals.noise * math.sqrt(signals.shares[0]) / poke)
@@ -278,6 +279,7 @@ class PhaseController:
             "likelihood": likelihood, "n_iterations": n_iterations,
         }  # fmt: skip
         self._of = calibration
+        calibration = replace(calibration, bench=None)  # a loop has no time for its corrections
         self._calibration = replace(calibration, n_iterations=n_iterations, tolerance=0.0)
         self._work, self._faintest = self._calibration._work, faintest
         self._straight = self._work.straight(calibration.saturation)

@@ -29,6 +29,7 @@ class Flag(IntFlag):
         Some of these are saturated.
     INCONSISTENT
         The residual exceeds 2.5 times that of the calibration's frames, more in faint light, or the call's limit.
+        With a fitted bench, it exceeds 1.4 times the noise: the frame is not the one that its phase predicts.
     NOT_CONVERGED
         The iteration used all its steps.
     MOVED
@@ -67,8 +68,8 @@ class Phases(PhaseResult):
     n_bad, n_saturated : ndarray of int, shape (...)
         Pixels of both images that are bad here and good in the calibration, and those of them that are saturated.
     residual : ndarray of float32, shape (...)
-        Rms difference of measured and modelled frames in the pupil; 1 = mean of a clear frame. NaN if the frame is
-        lost, or was not judged.
+        Rms difference of measured and modelled frames in the pupil; 1 = mean of a clear frame. With a fitted
+        bench, that of counts and their prediction, away from edges. NaN if the frame is lost, or was not judged.
     displacement : ndarray of float32, shape (..., 2), pixels
         Rows and columns by which the pupil has moved since the calibration, from its rim on both images. It comes
         out at 0.5 to 1.2 times the true value. With `follow` it holds the shift that was undone and what remains,

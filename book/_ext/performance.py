@@ -119,7 +119,7 @@ def rates(speed: dict[str, Any]) -> str:
         + [power(row[error]) if error in row else "" for error in ("median error", "largest error")]
         for row, setting in zip(chosen + speed["closed loop"], settings, strict=True)
     ]
-    return table(["setting", "rate (1/s)", "median error (rad)", "largest error (rad)"], rows)
+    return table(["setting", "rate (1/s)", "median error, no noise (rad)", "largest error (rad)"], rows)
 
 
 def looks(rows: list[dict[str, Any]]) -> str:
@@ -133,7 +133,7 @@ def looks(rows: list[dict[str, Any]]) -> str:
         for row in rows
     ]
     pair = f"one frame pair, {rows[0]['n_pixels']} pixels"
-    return table([pair, "time, in propagations of HCIPy", "median error (rad)"], lines)
+    return table([pair, "time, in propagations of HCIPy", "median error, no noise (rad)"], lines)
 
 
 def latency(rows: list[dict[str, Any]]) -> str:
@@ -171,7 +171,8 @@ def telemetry(measured: dict[str, Any]) -> str:
     files = f"{measured['frames']} simulated frame pairs of {measured['n_pixels']} pixels"
     sigma, of_modes = (parts[name] / parts["whole"] for name in ("sigma", "sigma of 50 modes"))
     return (
-        f"{files} took {measured['time']:.1f} s with {measured['threads']} threads, files included: "
+        f"Without commands, {files} took {measured['time']:.1f} s with {measured['threads']} threads, files "
+        "included: "
         f"{1e3 * measured['processor time'] / measured['frames']:.2f} ms of processor time for each pair. "
         f"The computation alone takes {parts['whole']:.2f} ms: "
         f"{parts['resampling']:.2f} ms for resampling, {parts['iteration']:.2f} ms for the iteration and "

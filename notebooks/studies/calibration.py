@@ -364,15 +364,15 @@ def findings(errors: Errors, faint: Errors, photons: Sequence[float], not_smooth
         listed = ", ".join(f"{rms:.2g}" for rms in short)
         bars = f" At {listed} rad rms the bars are too short: the error is up to {ratio.max():.2g} times the bar."
     return Text(
-        f"In bright light ({photons[0]:.0f} photons per pixel), the fitted model and the assumption of smooth "
-        "phases together change the error of unseen *screens* (random phase maps) by a factor of "
+        f"In bright light ({photons[0]:.0f} photons per point and image), the fitted model and the assumption of "
+        "smooth phases together change the error of unseen *screens* (random phase maps) by a factor of "
         f"{1 / gains.max():.2g} to {1 / gains.min():.2g}, compared with the phase-shifted iteration and the "
         "mask's design values. Without the assumption (`calibrate --commands`, diamonds) the factor is "
         f"{1 / bulk.max():.2g} to {1 / bulk.min():.2g}. In faint light ({photons[-1]:.0f} photons), at "
         f"{faint.rms[0]:.2g} rad rms, the error is {faint_calibrated:.2g} instead of {faint_plain:.2g} rad "
         f"rms.\n\nOf the pixels of all bright screens, {np.mean([screen.inside for screen in every]):.0%} have "
         f"an error below their error bar; 68 % are expected.{bars} The verdict is *consistent* for "
-        f"{sum(screen.consistent for screen in every)} of {len(every)} of these screens. It tests whether the "
+        f"{sum(screen.consistent for screen in every)} of {len(every)} bright screens. It tests whether the "
         "model explains the frames, not whether the phase is right."
     )
 

@@ -411,8 +411,9 @@ def findings_saxton(
         if method.unmeasured == "zero"
     ]
     return Text(
-        f"With zero field, the error at {by_width.rms[0]:g} rad rms is {'; '.join(zeros)}. If each image is "
-        f"reconstructed alone, on the detector of Figure 3, it is {two_digits(by_width.mean(AUTHORS)[0])} rad. "
+        f"With zero field and {by_width.strehl.shape[1]} screens, the error at {by_width.rms[0]:g} rad rms is "
+        f"{'; '.join(zeros)}. If each image is reconstructed alone, on the detector of Figure 3, it is "
+        f"{two_digits(by_width.mean(AUTHORS)[0])} rad. "
         f"With the modelled field and {variants[repaired].settings.n_iterations} iterations, on a detector of "
         f"{variants[repaired].sensor.extent:g} D, the error stays within "
         f"{percent(threshold)} of the input {_reach(by_width, longer)}."

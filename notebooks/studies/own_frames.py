@@ -238,8 +238,8 @@ def result_table(result: Phases) -> Table:
     return Table(
         ["quantity", "value"],
         [
-            ["first pupil: row, column, diameter (pixels)", pupils[0]],
-            ["second pupil: row, column, diameter (pixels)", pupils[1]],
+            ["outline of the first pupil: row, column, diameter (pixels)", pupils[0]],
+            ["outline of the second pupil: row, column, diameter (pixels)", pupils[1]],
             [
                 "shift of the second image (rows, columns; pixels)",
                 _with_error(placement.shift, placement.sigma[:2], 3),

@@ -83,7 +83,7 @@ def controllers(n_pixels=100, n_frames=2000):
         "bare product": lambda counts: product.matrix @ counts.take(pixels).astype(np.float32),
         "controller": lambda counts: product(counts, out=out),
         "three iterations": lambda counts: iterated(counts, out=out),
-        "method=Linear": lambda counts: calibration.coefficients(
+        "phase by Linear, then modes": lambda counts: calibration.coefficients(
             calibration(counts, judge=False, method=linear), modal
         ),
     }

@@ -204,13 +204,13 @@ def looks(seconds, n_pixels=100, rms=0.8):
         "one propagation of HCIPy": lambda: peer.optics[0].forward(incoming),
         "bare products": products,
         "one look": lambda: look(next(turn), out=out),
-        "LearnedReference": lambda: learned(next(turn)),
+        "full call": lambda: learned(next(turn)),
         "2 iterations, accelerated": lambda: two(next(turn)),
         "3 iterations, accelerated": lambda: three(next(turn)),
         name: lambda: convolutional(next(turn)),
     }
     phases = {
-        "one look": np.stack([look(frame) for frame in frames]), "LearnedReference": learned(frames).phase,
+        "one look": np.stack([look(frame) for frame in frames]), "full call": learned(frames).phase,
         "2 iterations, accelerated": two(frames).phase, "3 iterations, accelerated": three(frames).phase,
     }  # fmt: skip
     errors = {

@@ -57,6 +57,6 @@ def test_likelihood_is_timed_in_propagations():
 
 def test_roads_to_the_phase_are_timed_together():
     rows = {row["road"]: row for row in speed.looks(0, n_pixels=32)}
-    assert rows["one look"]["median error"] == pytest.approx(rows["LearnedReference"]["median error"], rel=1e-2)
+    assert rows["one look"]["median error"] == pytest.approx(rows["full call"]["median error"], rel=1e-2)
     assert rows["3 iterations, accelerated"]["median error"] < rows["one look"]["median error"] < 0.02
     assert all(row["time"] > 0 for row in rows.values())

@@ -176,7 +176,10 @@ def finish_folder(app: Sphinx, exception: Exception | None) -> None:
 
 
 def drop_icons(folder: Path) -> None:
-    """Keep only the icons that pages show: their rules, and their letters in the font. A script has them again."""
+    """Keep only the icons that pages show: their rules, and their letters in the font.
+
+    The script of the theme draws all icons a second time, so it is emptied.
+    """
     static = folder / "_static"
     (static / "scripts" / "fontawesome.js").write_text("", "utf-8")
     pages = "".join(page.read_text("utf-8") for page in folder.rglob("*.html"))

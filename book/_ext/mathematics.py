@@ -29,7 +29,7 @@ def visit_inline(translator: HTML5Translator, node: nodes.math) -> None:
 
 
 def visit_block(translator: HTML5Translator, node: nodes.math_block) -> None:
-    """Write a formula on lines of its own, after its number."""
+    """Write a displayed formula, after its number."""
     translator.body.append(translator.starttag(node, "div", CLASS=CLASSES))
     if node["number"]:
         translator.body.append(f'<span class="eqno">({get_node_equation_number(translator, node)})')

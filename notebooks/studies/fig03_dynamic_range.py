@@ -120,8 +120,8 @@ class SaxtonOfEachImage:
             waves = method.sensor.reference_wave(pupil.amplitude * np.exp(1j * phase))
             angles.append(np.angle(waves[..., 0, :, :][(..., *method.sensor.window)]))
             cosines.append(np.cos(phase - angles[-1]))
-        (one, two), (first, second) = np.exp(1j * np.array(angles)), cosines
-        phasor = 1j * (second * one - first * two) / np.imag(two * one.conj())
+        (unit, second_unit), (cosine, second_cosine) = np.exp(1j * np.array(angles)), cosines
+        phasor = 1j * (second_cosine * unit - cosine * second_unit) / np.imag(second_unit * unit.conj())
         return SimpleNamespace(phase=np.angle(phasor), converged=np.ones(frames.shape[:-3], bool))
 
 

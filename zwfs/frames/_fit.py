@@ -37,7 +37,7 @@ from zwfs.sensor import ZernikeSensor
 
 EXPLAINED = 1.2
 """Mean square of the residuals over the noise up to which a model explains the frames."""
-_WEAK = 0.02  # radian rms, of commands: weaker ones hardly tell properties of the bench from errors of its model
+_WEAK = 0.02  # radian rms, of commands: from weaker ones the fit learns little of the bench
 _FARTHEST = 3e-3  # D^2 / lambda: with more defocus the model's grid would be too small
 _PHASE_PRIOR = MapPrior(0.5, 3.0)
 _LEAST_FOCUS = 2e-4  # D^2 / lambda, where a fit starts with another sign of the focus

@@ -42,7 +42,7 @@ _STARTS = (("YORGSUBF", "XORGSUBF"), ("YSTART", "XSTART"), ("ESO DET WIN1 STRY",
            ("ESO DET WIN STARTY", "ESO DET WIN STARTX"))  # fmt: skip
 _WINDOWS = *_ENDS, *sum(_STARTS, ())
 _PER_SECOND = "/s", "/sec", "s-1", "s^-1", "s**-1"  # ends of units
-_SAME = 0.01  # relative difference of exposure times that is none
+_SAME = 0.01  # relative difference up to which exposure times count as equal
 _ALIKE = 5.0  # median absolute deviations by which two darks may differ
 # Header card of a phase map: no other file is replaced.
 _PHASE_CARD = b"CREATOR = 'zwfs "

@@ -444,12 +444,12 @@ def register(
     best, sigma = details.search(best, free)
     most = details.reach * np.array([np.inf, np.inf, np.radians(_LARGEST_TURN), _LARGEST_STRETCH])
 
-    def unsure() -> NDArray[np.bool_]:
+    def undetermined() -> NDArray[np.bool_]:
         significant = np.where(np.abs(best) < most, _SIGNIFICANT * np.abs(best), 0)
         return turns & free & ~(sigma < np.maximum(_SURE, significant))
 
-    while (unsure_values := unsure()).any():
-        worst = np.argmax(np.where(unsure_values, np.nan_to_num(sigma, nan=np.inf), -1))
+    while (unsure := undetermined()).any():
+        worst = np.argmax(np.where(unsure, np.nan_to_num(sigma, nan=np.inf), -1))
         free[worst], best[worst] = False, 0
         best, sigma = details.search(best, free)
     scale = np.array([1, 1, np.degrees(1 / details.reach), 1 / details.reach])

@@ -409,7 +409,7 @@ def findings_model(model: Mapping[str, ErrorCurves], noise: NoiseCurves) -> Text
         largest = sorted(errors, key=lambda kind: -errors[kind])[:2]
         listed = ", ".join(f"{small(errors[kind])} rad ({kind})" for kind in largest)
         light = f"{small(noise.median(LIKELY)[place])} rad (noise of {_spaced(noise.photons)} photons)"
-        lines.append(f"- **At {rms[place]:.3g} rad rms:** {listed}; for comparison, {light}.")
+        lines.append(f"- At {rms[place]:.3g} rad rms: {listed}; for comparison, {light}.")
     return Text("\n".join(lines))
 
 

@@ -261,7 +261,7 @@ def findings_wide(curves: Mapping[float, PhotonCurves]) -> Text:
         likely, shifted = (f"{case.ratio(name)[row, column]:.3g}" for name in TABLED)
         worst = np.max((case.errors["PhaseShifted"] / case.bound)[row, column])
         sentences.append(
-            f"- **Dimples of {diameter:g} λ/D**, at {case.rms[row]:g} rad rms and {case.photons[column]:g} "
+            f"- Dimples of {diameter:g} λ/D, at {case.rms[row]:g} rad rms and {case.photons[column]:g} "
             f"photons: the median error is {likely} times the bound with maximum likelihood and {shifted} times "
             f"with the iteration (worst screen: {worst:.3g})."
         )
@@ -272,7 +272,7 @@ def findings_bars(rows: Sequence[ErrorBars]) -> Text:
     """Return the shares of the points within one standard error, and of the results called consistent."""
     place = int(np.argmin(np.abs(SIGMAS - 1)))
     shares = [
-        f"- **{_label(row)}:** {row.within[place]:.0%} of the points, and {row.consistent:.0%} of the results are "
+        f"- {_label(row)}: {row.within[place]:.0%} of the points, and {row.consistent:.0%} of the results are "
         "called consistent."
         for row in rows
     ]

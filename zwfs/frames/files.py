@@ -501,7 +501,8 @@ def _companion(
     same = [part for file in files if (part := _on_window(file, frame))]
     if not same:
         raise ValueError(
-            f"{argument}: {_names(files)} has shape {first_shape}: expected {shape}, that of {frame.name}"
+            f"{argument}: {_names(files)} has shape {first_shape}: expected {shape}, that of {frame.name}, "
+            "or headers with DETSEC that state where both windows lie"
         )
     for file in same:
         if argument == "bad_pixels" and (share := np.mean(file.images != 0)) > 0.5:
@@ -514,8 +515,8 @@ def _companion(
     if not fitting:
         warnings.warn(f"darks: {differences[0]}: expected a dark with the same settings", stacklevel=4)
     by_image = _by_image(argument, fitting or same, 1 if n_images == 1 else None)
-    if len(by_image) > n_images:
-        raise ValueError(f"{argument}: {_names(same)}: 2 images for the 1 of {frame.name}: expected one")
+    if len(by_image) > n_images:  # two units for frames of one image are two exposures
+        by_image = [by_image[0] + by_image[1]]
     chosen = by_image[index if len(by_image) > 1 else 0]
     if argument == "darks":
         _check_alike(chosen)

@@ -17,6 +17,7 @@ from scipy import ndimage
 from zwfs import _check
 from zwfs._images import mean_light, nearest_good, radius
 from zwfs.frames._grid import iterated
+from zwfs.frames._outline import NEAR, gains
 from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Image, RegisteredFrames, correlations, register_frames
 from zwfs.masks import Dimple, Mask
 from zwfs.pupil import Pupil
@@ -38,11 +39,8 @@ __all__ = [
 
 MOST_ITERATIONS = 10_000  # of a pair of frames: more take minutes and change nothing
 _DARK = 0.1  # of the largest amplitude: a point with less is outside
-NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
 _HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
-_DEGREE = 4  # of the polynomials that describe how unlike the two arms are
-_CERTAIN = 3.0  # standard errors: less of a difference between the arms is noise
 _DOUBTFUL, _UNLIKE = 0.08, 4.0  # of the light, and of the noise of the frames: a larger residual is worth a word
 _SECOND = 1.0, -2.0, 1.0  # a smooth phase hardly changes the second differences
 MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
@@ -433,7 +431,7 @@ def clear_light(registered: RegisteredFrames, pupil_background: float) -> ClearL
     background = _backgrounds(registered) if registered.background else np.zeros(4)
     stop = radius((n, n), center) <= registered.diameter / 2
     clear -= background[2:, None, None]
-    gain = _gains(clear, stop & ~bad.any(axis=0), center, registered.diameter)
+    gain = gains(clear, stop & ~bad.any(axis=0), center, registered.diameter)
     light, scale = mean_light(clear / gain, stop)
     light = np.where(stop, np.maximum(light - pupil_background, 0), 0)
     amplitude = _amplitude(light, registered.diameter)
@@ -470,31 +468,6 @@ def reduce_with(clear: ClearLight, registered: RegisteredFrames, optics: Optics,
         registered, optics, intensity, pupil, clear.rest, bad, margin, counts, clear.background, ratio,
         np.pad(clear.gain, around, "edge"),
     )  # fmt: skip
-
-
-def _gains(images: NDArray, inside: NDArray, center: tuple[float, float], diameter: float) -> NDArray[np.float64]:
-    """Gains of two arms, (2, ny, nx), whose product is 1 and whose ratio is that of their clear frames.
-
-    The logarithm of the ratio is a polynomial in the pupil, and constant along a ray beyond it. Coefficients of
-    orthonormal polynomials shrink by their noise, to 0 below 3 standard errors.
-    """
-    mean = np.where(inside, images.mean(axis=0), 0)
-    lit = ndimage.binary_erosion(mean > np.median(mean[inside]) / 2, np.ones((3, 3)), NEAR)
-    lit &= (images > 0).all(axis=0)
-    rows, columns = (np.indices(lit.shape) - np.reshape(center, (2, 1, 1))) * 2 / diameter
-    beyond = np.maximum(np.hypot(rows, columns), 1)
-    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    terms = np.stack([(rows / beyond) ** i * (columns / beyond) ** j for i, j in powers], axis=-1)
-    if np.count_nonzero(lit) < 4 * len(powers):
-        return np.ones_like(images)
-    ratio = np.log(images[1, lit] / images[0, lit])
-    basis, triangle = np.linalg.qr(terms[lit])
-    coefficients = basis.T @ ratio
-    noise = 1.48 * np.median(np.abs(ratio - basis @ coefficients))  # robust standard deviation
-    coefficients *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(coefficients**2, 1e-300), 0)
-    coefficients[0] = 0  # the scale of each image is measured apart
-    half = terms @ np.linalg.solve(triangle, coefficients) / 2
-    return np.exp([-half, half])
 
 
 def _fully_lit(amplitude: NDArray, diameter: float, least: float, apart: int) -> NDArray[np.bool_]:

@@ -15,6 +15,7 @@ _NEARLY_ALL = 0.98  # of the points of an outline: a few may be noise
 _LIT = 0.2  # of the light of most rays: one with less ends in the dark
 NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _DEGREE = 4  # of the polynomials that describe how unlike the two arms are
+UNEVEN = 0.02  # relative difference of the gain of two arms over the pupil that counts
 _CERTAIN = 3.0  # standard errors: less of a difference between the arms is noise
 _OUTER = 0.75  # pixels from the outermost points: those with less are on the circle around the pupil
 
@@ -92,10 +93,14 @@ def _least(cost: Callable[[NDArray], Any], points: NDArray) -> NDArray[np.float6
     return optimize.minimize(cost, points.mean(axis=0), method="Nelder-Mead", options={"xatol": 0.01}).x
 
 
-def gains(images: NDArray, inside: NDArray, center: tuple[float, float], diameter: float) -> NDArray[np.float64]:
-    """Gains of two arms, (2, ny, nx), whose product is 1 and whose ratio is that of their clear frames.
+def gains(
+    images: NDArray, inside: NDArray, center: tuple[float, float], diameter: float, share: float | None = 0.5
+) -> NDArray[np.float64]:
+    """Gains of two arms, (2, ny, nx), whose ratio is that of their clear frames; the first has a share of it.
 
-    The logarithm of the ratio is a polynomial in the pupil, and constant along a ray beyond it. Coefficients of
+    With a share of None, the light before the masks is even, and the clear frames are the gains.
+
+    The logarithm is a polynomial in the pupil, and constant along a ray beyond it. Coefficients of
     orthonormal polynomials shrink by their noise, to 0 below 3 standard errors.
     """
     mean = np.where(inside, images.mean(axis=0), 0)
@@ -107,14 +112,15 @@ def gains(images: NDArray, inside: NDArray, center: tuple[float, float], diamete
     terms = np.stack([(rows / beyond) ** i * (columns / beyond) ** j for i, j in powers], axis=-1)
     if np.count_nonzero(lit) < 4 * len(powers):
         return np.ones_like(images)
-    ratio = np.log(images[1, lit] / images[0, lit])
+    values = np.log(images[:, lit])
+    if share is not None:
+        values = np.outer([-share, 1 - share], values[1] - values[0])
     basis, triangle = np.linalg.qr(terms[lit])
-    coefficients = basis.T @ ratio
-    noise = 1.48 * np.median(np.abs(ratio - basis @ coefficients))  # robust standard deviation
+    coefficients = values @ basis
+    noise = 1.48 * np.median(np.abs(values - coefficients @ basis.T), axis=1, keepdims=True)  # robust deviation
     coefficients *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(coefficients**2, 1e-300), 0)
-    coefficients[0] = 0  # the scale of each image is measured apart
-    half = terms @ np.linalg.solve(triangle, coefficients) / 2
-    return np.exp([-half, half])
+    coefficients[:, 0] = 0  # the scale of each image is measured apart
+    return np.exp(np.moveaxis(terms @ np.linalg.solve(triangle, coefficients.T), -1, 0))
 
 
 class Details:

@@ -51,7 +51,7 @@ _RANGES = (
     ("light_ratio", 0, math.inf), ("n_averaged", 1, math.inf), ("n_images", 1, 2), ("diameter", 1, math.inf),
 )  # fmt: skip
 _OF_BENCH = "bench_"  # first letters of the names of its arrays in a file
-_APART = 0.25  # pixels between the pupils on frames and clear frames that are worth a word
+_APART = 0.35  # pixels between the pupils on frames and clear frames that are worth a word
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 
 

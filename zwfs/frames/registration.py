@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from zwfs import _check
 from zwfs._images import nearest_good, radius, turning
-from zwfs.frames._outline import Circle, Details, gains, outline, threshold
+from zwfs.frames._outline import UNEVEN, Circle, Details, gains, outline, threshold
 
 __all__ = ["Placement", "RegisteredFrames", "register_frames"]
 
@@ -33,7 +33,6 @@ _BLUR = 2.0  # pixels rms: finest detail that counts for registration
 # A rotation or magnification is fitted if its standard error is below so many pixels at the edge of the pupil, or
 # below this part of its value.
 _SURE, _SIGNIFICANT = 0.05, 0.1
-_UNEVEN = 0.02  # relative difference of the gain of two arms over the pupil that is undone for registration
 _EDGE, _AROUND = 3, 8  # pixels around the pupil: those that take part where the surroundings are there, and all
 # A pixel beyond all neighbours but one, by so many times their spread and noise: on frame and clear frame, on one.
 _ODD_ON_BOTH, _ODD = 0.5, 3.0
@@ -578,7 +577,7 @@ def _register(rough: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
     center = rough.center[0] + _AROUND, rough.center[1] + _AROUND
     inside = radius(images.shape[1:], center) <= reach
     gain = gains(images, inside & ~bad.any(axis=0), center, rough.diameter)
-    if np.ptp(gain[1]) > _UNEVEN:  # the edge of unevenly lit arms looks moved and stretched
+    if np.ptp(gain[1]) > UNEVEN:  # the edge of unevenly lit arms looks moved and stretched
         images = images / gain
     ratio = second.diameter / first.diameter
     placement = register(images[1], images[0], inside, center, turn=True, magnification=ratio)

@@ -323,6 +323,7 @@ def single_error(single, phase, corner):
     return np.nanstd(bench.difference(phase, corner, screen))
 
 
+@pytest.mark.filterwarnings("error")
 def test_one_image_gives_the_phase_and_no_verdict(single):
     estimate = phase_of(*single[2:], phase_shifts=(np.pi / 2,))
     assert single_error(single, estimate.phase, estimate.measurement.registered.corner) < 0.015  # 1.5 nm

@@ -379,7 +379,7 @@ class Calibration(Immutable):
         residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
         if remark := doubt(measurement, phase[0]):
             warnings.warn(remark, stacklevel=3)
-        if np.abs(shift).max() > _APART:
+        if np.abs(shift).max() > _APART and not measurement.optics.single:  # one image cannot tell phase from shift
             row, column = shift[0]
             warnings.warn(
                 f"The pupil on the frames is off its place on the clear frames, by {row:+.1f} rows and {column:+.1f} "

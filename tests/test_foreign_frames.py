@@ -289,7 +289,7 @@ def test_messages_name_the_cause(arms, tmp_path):
     with pytest.raises(ValueError, match="frames less the dark: all pixels are NaN"):
         phase_of(frame * np.nan, clear)
     files = [[tmp_path / f"{name}{k}.npy" for k in (1, 2)] for name in ("frame", "clear")]
-    for path, counts in zip(sum(files, []), (frame, frame, clear, clear), strict=True):
+    for path, counts in zip((*files[0], *files[1]), (frame, frame, clear, clear), strict=True):
         np.save(path, counts)
     with pytest.raises(ValueError, match="with both pupils on each exposure, set n_images = 1"):
         Calibration.from_files(*files, diameter=1.06, phase_shifts=(np.pi / 2, -np.pi / 2))

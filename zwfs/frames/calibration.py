@@ -379,11 +379,13 @@ class Calibration(Immutable):
         residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
         if remark := doubt(measurement, phase[0]):
             warnings.warn(remark, stacklevel=3)
-        if np.abs(shift).max() > _APART and not measurement.optics.single:  # one image cannot tell phase from shift
+        # In one image a phase at the edge looks like a shift.
+        if np.abs(shift).max() > _APART and not measurement.optics.single:
             row, column = shift[0]
             warnings.warn(
-                f"The pupil on the frames is off its place on the clear frames, by {row:+.1f} rows and {column:+.1f} "
-                "columns or more: expected the same place; look at the windows on the detector (DETSEC of a header)",
+                f"The pupil on the frames is off its place on the clear frames, by {row:+.1f} rows and "
+                f"{column:+.1f} columns or more: expected the same place; look at the windows on the detector "
+                "(DETSEC of a header)",
                 stacklevel=3,
             )
         return replace(

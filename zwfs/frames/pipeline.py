@@ -616,7 +616,7 @@ def doubt(measurement: Measurement, phase: NDArray) -> str:
 
 
 def _misfit_far(measurement: Measurement, phase: NDArray) -> float:
-    """Rms difference of frames and their model with a phase (ny, nx), far from edges; infinite if all is near one."""
+    """Rms difference of frames and model with a phase (ny, nx), far from edges; infinite if there are none."""
     agreement, far = measurement.agreement(phase), measurement.good & ~near_edges(measurement)
     missing = (agreement.measured - agreement.modelled)[(..., *measurement.window)][:, far]
     return float(np.sqrt(np.mean(missing**2))) if far.any() else np.inf

@@ -41,7 +41,8 @@ MOST_ITERATIONS = 10_000  # of a pair of frames: more take minutes and change no
 _DARK = 0.1  # of the largest amplitude: a point with less is outside
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
 _HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
-_ROUGHLY, _SURELY = 10, 0.92  # iterations, and rms difference of frames and model by which a gain fits better
+_ROUGHLY = 10  # iterations
+_SURELY = 0.92  # part of the misfit, with which another distribution of the gain is better
 _DOUBTFUL, _UNLIKE = 0.08, 4.0  # of the light, and of the noise of the frames: a larger residual is worth a word
 _SECOND = 1.0, -2.0, 1.0  # a smooth phase hardly changes the second differences
 MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
@@ -383,7 +384,7 @@ def measured(
 
 def _plain(counts: ArrayLike) -> ArrayLike:
     """Counts with NaN in the place of what a masked array masks."""
-    return counts.astype(float).filled(np.nan) if isinstance(counts, np.ma.MaskedArray) else counts
+    return np.ma.filled(counts.astype(float), np.nan) if isinstance(counts, np.ma.MaskedArray) else counts
 
 
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:

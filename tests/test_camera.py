@@ -80,7 +80,6 @@ def test_saturation_is_given_in_the_header_of_the_type_or_seen(tmp_path, counts,
     ("others", "message"),
     [
         (([FRAME[1:]],), r"dark_files: dark\.fits has shape \(19, 30\)"),
-        (([FRAME] * 2,), r"dark\.fits: 2 images for the 1"),
         (([FRAME + np.nan],), r"frame\.fits, dark\.fits: all pixels are bad"),
         (((), [(FRAME != 7).astype(int)]), r"bad_pixels: map\.fits marks 99\.5% .* 1 = good"),
         (((), [FRAME.T]), r"bad_pixel_files: map\.fits has shape"),
@@ -135,9 +134,9 @@ def test_cards_that_do_not_follow_the_standard_are_left_out(tmp_path):
 
 
 def test_keyword_that_no_bench_can_have_is_named_where_it_is_needed():
-    for value in (0, -5, np.inf, "red"):
+    for value in (0, -5, 1.6, np.inf, "red"):
         file = camera.CameraFile(FRAME[np.newaxis], "a.fits", "", {"WAVELEN": value})
-        with pytest.raises((TypeError, ValueError), match=r"a\.fits: WAVELEN = "):
+        with pytest.raises((TypeError, ValueError), match=r"a\.fits: WAVELEN .nm. = "):
             file.keyword("WAVELEN")
 
 

@@ -217,6 +217,44 @@ def test_arrays_have_a_saturation_and_an_exposure(arms):
     assert phases.measurement.n_bad > 20
 
 
+UNEVEN = {
+    "gradient": lambda y, x: (1, 1 + 0.3 * y),
+    "vignette": lambda y, x: (1 - 0.25 * (x**2 + y**2), 1),
+    "both arms": lambda y, x: (1 + 0.2 * x, np.exp(-(x**2) - y**2)),
+    "one vignette for both": lambda y, x: (np.exp(-(x**2) - y**2),) * 2,
+}
+
+
+@pytest.mark.parametrize("kind", UNEVEN)
+def test_gains_behind_the_masks_leave_the_phase_alone(arms, kind):
+    bench, _, frame, clear, _ = arms
+    rows, columns = (np.indices((bench.side,) * 2) - (bench.side - 1) / 2) * 2 / bench.pixels
+    gain = np.hstack(np.broadcast_arrays(*UNEVEN[kind](rows, columns), rows)[:2])
+    phases = phase_of(frame * gain, clear * gain)
+    assert arms_error(arms, phases.phase, phases.measurement.registered.corner) < 0.012
+
+
+def test_frames_off_the_clear_frames_give_a_warning(arms):
+    _, _, frame, clear, _ = arms
+    with pytest.warns(UserWarning, match="off its place on the clear frames"):
+        phase_of(np.roll(frame, 2, axis=1), clear)
+
+
+def test_masked_arrays_and_two_units_of_a_dark_are_read(arms, tmp_path):
+    _, _, frame, clear, dark = arms
+    bad = np.zeros(frame.shape, bool)
+    bad[20, 25] = True
+    phases = phase_of(np.ma.array(np.where(bad, 6e4, frame), mask=bad), clear)
+    assert arms_error(arms, phases.phase, phases.measurement.registered.corner) < 0.015
+    units = fits.HDUList([fits.PrimaryHDU(), fits.ImageHDU(dark), fits.ImageHDU(dark[::-1])])
+    units.writeto(tmp_path / "dark.fits")
+    for name, counts in (("frame", frame + dark), ("clear", clear + dark)):
+        np.save(tmp_path / f"{name}.npy", counts)
+    files = ([tmp_path / name] for name in ("frame.npy", "clear.npy", "dark.fits"))
+    calibration = Calibration.from_files(*files, diameter=1.06, phase_shifts=(np.pi / 2, -np.pi / 2))
+    np.testing.assert_allclose(calibration.dark[0], (dark + dark[::-1]) / 2, rtol=1e-6)
+
+
 def test_frames_that_no_phase_explains_give_a_warning(arms):
     _, _, frame, clear, _ = arms
     half = frame.shape[1] // 2
@@ -250,6 +288,11 @@ def test_messages_name_the_cause(arms, tmp_path):
         Calibration.from_files(*files, diameter=1.06, phase_shifts=(np.pi / 2, -np.pi / 2))
     with pytest.raises(ValueError, match="frames less the dark: all pixels are NaN"):
         phase_of(frame * np.nan, clear)
+    files = [[tmp_path / f"{name}{k}.npy" for k in (1, 2)] for name in ("frame", "clear")]
+    for path, counts in zip((*files[0], *files[1]), (frame, frame, clear, clear), strict=True):
+        np.save(path, counts)
+    with pytest.raises(ValueError, match="with both pupils on each exposure, set n_images = 1"):
+        Calibration.from_files(*files, diameter=1.06, phase_shifts=(np.pi / 2, -np.pi / 2))
     lit = clear > clear.max() / 2
     marked = Image(np.where(lit, 0, clear), lit)
     with pytest.raises(ValueError, match="of its pixels are marked as bad: expected a map that is 0 where good"):
@@ -280,6 +323,7 @@ def single_error(single, phase, corner):
     return np.nanstd(bench.difference(phase, corner, screen))
 
 
+@pytest.mark.filterwarnings("error")
 def test_one_image_gives_the_phase_and_no_verdict(single):
     estimate = phase_of(*single[2:], phase_shifts=(np.pi / 2,))
     assert single_error(single, estimate.phase, estimate.measurement.registered.corner) < 0.015  # 1.5 nm

@@ -229,7 +229,7 @@ def ambiguous(arrays: list[Images], reason: str = "") -> FileError:
     units = ", ".join(f"[{one.unit}] {one.title} {one.full} {one.dtype}".replace("  ", " ") for one in arrays)
     return FileError(
         f"{name}: it has {len(arrays)} image units, {units}{reason}: expected one; choose it by its number or "
-        f"name, as '{name}[{arrays[0].unit}]'"
+        f"name, as '{name}[{arrays[0].unit}]', or set n_images if all are exposures"
     )
 
 

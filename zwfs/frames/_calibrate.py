@@ -118,7 +118,7 @@ def _measured(states: _States, optics: Optics, place: dict[str, Any]) -> Measure
 def _error_of_last(calibration: Calibration, grid: Calibration, states: _States) -> float:
     """Rms error, radian, with which a calibration measures the last command less the first.
 
-    Phases are compared on the grid of the commands, which another calibration has, 2 pixels and more from edges.
+    Phases are compared on the grid of the commands, which another calibration has, off the edges if possible.
     """
     images = np.nan_to_num(states.frames[[0, -1]].mean(axis=1)) + states.dark
     phases = calibration(images[:, 0] if calibration.n_images == 1 else images, saturation=np.inf).phase
@@ -126,10 +126,10 @@ def _error_of_last(calibration: Calibration, grid: Calibration, states: _States)
     waves = np.nan_to_num(np.exp(1j * phases.astype(float)))
     first, last = (ndimage.map_coordinates(wave, (row, column), order=1) for wave in waves)
     change = np.exp(1j * (states.commands[-1] - states.commands[0]))
-    inner = ndimage.binary_erosion(grid.good, iterations=2)
-    compared = inner & (
-        np.minimum(np.abs(first), np.abs(last)) > 0.8
-    )  # next to a point without a phase it is smaller
+    # Next to a point without a phase a wave is smaller.
+    usable = grid.good & (np.minimum(np.abs(first), np.abs(last)) > 0.8)
+    layers = [usable, *(usable & ndimage.binary_erosion(grid.good, iterations=apart) for apart in (1, 2))]
+    compared = [points for points in layers if points.any()][-1]  # segments may be narrow
     error = (last * np.conj(first * change))[compared]
     return float(np.angle(error * np.conj(error.mean())).std())
 

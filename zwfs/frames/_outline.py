@@ -1,4 +1,4 @@
-"""Outline of a pupil on an image, and the details by which two images of it are registered."""
+"""Outline of a pupil on an image, and the gain and the details by which two images of it differ."""
 
 from __future__ import annotations
 
@@ -13,6 +13,10 @@ from zwfs._images import turning
 
 _NEARLY_ALL = 0.98  # of the points of an outline: a few may be noise
 _LIT = 0.2  # of the light of most rays: one with less ends in the dark
+NEAR = 2  # pixels from a gap, vane or edge that count as near it
+_DEGREE = 4  # of the polynomials that describe how unlike the two arms are
+UNEVEN = 0.02  # relative difference of the gain of two arms over the pupil that counts
+_CERTAIN = 3.0  # standard errors: less of a difference between the arms is noise
 _OUTER = 0.75  # pixels from the outermost points: those with less are on the circle around the pupil
 
 
@@ -87,6 +91,36 @@ def _apart(points: NDArray, center: NDArray) -> NDArray[np.float64]:
 def _least(cost: Callable[[NDArray], Any], points: NDArray) -> NDArray[np.float64]:
     """Centre of the least cost, from that of the points."""
     return optimize.minimize(cost, points.mean(axis=0), method="Nelder-Mead", options={"xatol": 0.01}).x
+
+
+def gains(
+    images: NDArray, inside: NDArray, center: tuple[float, float], diameter: float, share: float | None = 0.5
+) -> NDArray[np.float64]:
+    """Gains of two arms, (2, ny, nx), whose ratio is that of their clear frames; the first has a share of it.
+
+    With a share of None, the light before the masks is even, and the clear frames are the gains.
+
+    The logarithm is a polynomial in the pupil, and constant along a ray beyond it. Coefficients of
+    orthonormal polynomials shrink by their noise, to 0 below 3 standard errors.
+    """
+    mean = np.where(inside, images.mean(axis=0), 0)
+    lit = ndimage.binary_erosion(mean > np.median(mean[inside]) / 2, np.ones((3, 3)), NEAR)
+    lit &= (images > 0).all(axis=0)
+    rows, columns = (np.indices(lit.shape) - np.reshape(center, (2, 1, 1))) * 2 / diameter
+    beyond = np.maximum(np.hypot(rows, columns), 1)
+    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
+    terms = np.stack([(rows / beyond) ** i * (columns / beyond) ** j for i, j in powers], axis=-1)
+    if np.count_nonzero(lit) < 4 * len(powers):
+        return np.ones_like(images)
+    values = np.log(images[:, lit])
+    if share is not None:
+        values = np.outer([-share, 1 - share], values[1] - values[0])
+    basis, triangle = np.linalg.qr(terms[lit])
+    coefficients = values @ basis
+    noise = 1.48 * np.median(np.abs(values - coefficients @ basis.T), axis=1, keepdims=True)  # robust deviation
+    coefficients *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(coefficients**2, 1e-300), 0)
+    coefficients[:, 0] = 0  # the scale of each image is measured apart
+    return np.exp(np.moveaxis(terms @ np.linalg.solve(triangle, coefficients.T), -1, 0))
 
 
 class Details:

@@ -51,6 +51,7 @@ _RANGES = (
     ("light_ratio", 0, math.inf), ("n_averaged", 1, math.inf), ("n_images", 1, 2), ("diameter", 1, math.inf),
 )  # fmt: skip
 _OF_BENCH = "bench_"  # first letters of the names of its arrays in a file
+_APART = 0.35  # pixels between the pupils on frames and clear frames that are worth a word
 _PIECE = 8  # exposures that are handled together: more do not fit the fast memory of a processor
 
 
@@ -348,7 +349,7 @@ class Calibration(Immutable):
         ----------
         measurement : Measurement
             Of frames that are taken as those to come, and of clear frames. Its images know the dark. If no phase
-            explains them, there is a warning.
+            explains them, or the pupil has moved between frames and clear frames, there is a warning.
         **settings
             Attributes of the calibration: saturation, bunit, n_iterations, tolerance.
         """
@@ -378,6 +379,15 @@ class Calibration(Immutable):
         residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
         if remark := doubt(measurement, phase[0]):
             warnings.warn(remark, stacklevel=3)
+        # In one image a phase at the edge looks like a shift.
+        if np.abs(shift).max() > _APART and not measurement.optics.single:
+            row, column = shift[0]
+            warnings.warn(
+                f"The pupil on the frames is off its place on the clear frames, by {row:+.1f} rows and "
+                f"{column:+.1f} columns or more: expected the same place; look at the windows on the detector "
+                "(DETSEC of a header)",
+                stacklevel=3,
+            )
         return replace(
             calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
             residual=float(residual[0]), light_ratio=float(ratio[0]),

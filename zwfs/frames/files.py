@@ -34,7 +34,8 @@ __all__ = ["CameraFile", "check_output", "read", "read_all", "write_phase"]
 
 _PLATEAU = 10  # pixels that share exactly the largest value: noise does not do that, saturation does
 _PIECE = 2**22  # pixels of exposures that are read at once
-_POSITIVE = ("WAVELEN", "DIMPLE", "EGAIN", "SATURATE")  # keywords whose value is above 0
+_POSITIVE = ("DIMPLE", "EGAIN", "SATURATE")  # keywords whose value is above 0
+SHORTEST = 10.0  # nm: a smaller WAVELEN is in another unit
 # Keywords of the exposure time, and of the window on the detector: its ends, or where its rows and columns begin.
 _TIMES = "EXPTIME", "EXPOSURE", "ITIME", "TINT", "ESO DET DIT", "ESO DET SEQ1 DIT"
 _ENDS = "DETSEC", "CCDSEC", "SUBRECT"
@@ -93,15 +94,16 @@ class CameraFile:
         Raises
         ------
         ValueError
-            If the header lacks the keyword, or its value is not a number that the keyword can have: WAVELEN,
-            DIMPLE, EGAIN and SATURATE are above 0.
+            If the header lacks the keyword, or its value is not a number that the keyword can have: DIMPLE, EGAIN
+            and SATURATE are above 0, and WAVELEN is above 10 nm.
         """
         _check.instance("key", key, str)
         if key not in self.header:
             name = _check.shown(key)[1:-1]
             raise ValueError(f"{self.name}: its header has no {name} (key): give the value as a parameter")
-        low = 0 if key in _POSITIVE else -np.inf
-        return _check.number(f"{self.name}: {key}", self.header[key], low, open_low=True)
+        low = SHORTEST if key == "WAVELEN" else 0 if key in _POSITIVE else -np.inf
+        unit = " (nm)" * (key == "WAVELEN")
+        return _check.number(f"{self.name}: {key}{unit}", self.header[key], low, open_low=True)
 
     def optics(self, diameter: float = 0.0, phase_shifts: Sequence[float] = ()) -> Optics:
         """Optics with these values, see `Optics`; by default DIMPLE, THETA1 and any THETA2 of the header."""
@@ -501,7 +503,8 @@ def _companion(
     same = [part for file in files if (part := _on_window(file, frame))]
     if not same:
         raise ValueError(
-            f"{argument}: {_names(files)} has shape {first_shape}: expected {shape}, that of {frame.name}"
+            f"{argument}: {_names(files)} has shape {first_shape}: expected {shape}, that of {frame.name}, "
+            "or headers with DETSEC that state where both windows lie"
         )
     for file in same:
         if argument == "bad_pixels" and (share := np.mean(file.images != 0)) > 0.5:
@@ -514,8 +517,8 @@ def _companion(
     if not fitting:
         warnings.warn(f"darks: {differences[0]}: expected a dark with the same settings", stacklevel=4)
     by_image = _by_image(argument, fitting or same, 1 if n_images == 1 else None)
-    if len(by_image) > n_images:
-        raise ValueError(f"{argument}: {_names(same)}: 2 images for the 1 of {frame.name}: expected one")
+    if len(by_image) > n_images:  # two units for frames of one image are two exposures
+        by_image = [by_image[0] + by_image[1]]
     chosen = by_image[index if len(by_image) > 1 else 0]
     if argument == "darks":
         _check_alike(chosen)

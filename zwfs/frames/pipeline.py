@@ -17,6 +17,7 @@ from scipy import ndimage
 from zwfs import _check
 from zwfs._images import mean_light, nearest_good, radius
 from zwfs.frames._grid import iterated
+from zwfs.frames._outline import NEAR, UNEVEN, gains
 from zwfs.frames.registration import CLEAR_FRAMES, FRAMES, Image, RegisteredFrames, correlations, register_frames
 from zwfs.masks import Dimple, Mask
 from zwfs.pupil import Pupil
@@ -38,11 +39,10 @@ __all__ = [
 
 MOST_ITERATIONS = 10_000  # of a pair of frames: more take minutes and change nothing
 _DARK = 0.1  # of the largest amplitude: a point with less is outside
-NEAR = 2  # pixels from a gap, vane or edge that count as near it
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
 _HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
-_DEGREE = 4  # of the polynomials that describe how unlike the two arms are
-_CERTAIN = 3.0  # standard errors: less of a difference between the arms is noise
+_ROUGHLY = 10  # iterations
+_SURELY = 0.92  # part of the misfit, with which another distribution of the gain is better
 _DOUBTFUL, _UNLIKE = 0.08, 4.0  # of the light, and of the noise of the frames: a larger residual is worth a word
 _SECOND = 1.0, -2.0, 1.0  # a smooth phase hardly changes the second differences
 MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
@@ -171,6 +171,8 @@ class Measurement:
         with the mask out.
     gain : ndarray, shape (2, ny', nx') or (2, 1, 1)
         Smooth gain of each arm, by the ratio of the clear frames; `intensity` still contains it.
+    share : float or None
+        Part of the ratio of the gains that the first arm has; None if the light before the masks is even.
     """
 
     registered: RegisteredFrames
@@ -184,6 +186,7 @@ class Measurement:
     background: NDArray[np.float64]
     flux_ratio: tuple[float, float]
     gain: NDArray[np.float64] = field(default_factory=lambda: np.ones((2, 1, 1)))
+    share: float | None = 0.5
 
     def __post_init__(self) -> None:
         _check.declared(self)
@@ -325,6 +328,7 @@ def phase_of(
     """
     from zwfs.frames.calibration import Calibration  # late: it needs this module
 
+    frames = _plain(frames)
     measurement = measured(frames, clear_frames, dark, Optics(**optics), saturation, exposure)
     return replace(Calibration.of(measurement, saturation=saturation)(frames), measurement=measurement)
 
@@ -364,25 +368,32 @@ def measured(
     saturation = _check.number_or_inf("saturation", saturation, open_low=True)
     unlit, pair = 0 if dark is None else _check.real_array("dark", dark), []
     for name, counts in (("frames", frames), ("clear_frames", clear_frames)):
-        images = _check.real_array(name, counts)
+        images = _check.real_array(name, _plain(counts))
         images = np.where(images >= saturation, np.nan, images)
         if images.ndim not in (2, 3) or images.shape[:-2] not in ((), (2,)):
             expected = "(ny, nx), or (2, ny, nx) for two images; average several exposures first"
             raise ValueError(f"{name} has shape {images.shape}: expected {expected}")
         if np.shape(unlit) not in ((), images.shape[-2:], images.shape):
-            raise ValueError(f"dark has shape {np.shape(unlit)}: expected {images.shape}, that of {name}")
+            expected = f"{images.shape}, that of {name}; average several exposures first"
+            raise ValueError(f"dark has shape {np.shape(unlit)}: expected {expected}")
         maps = np.stack(np.broadcast_arrays(images - unlit, unlit)).reshape(2, -1, *images.shape[-2:])
         pair.append([Image.of(counts, name, lightless) for counts, lightless in zip(*maps, strict=True)])
     registered = register_frames(*pair, n_pupils=len(optics.phase_shifts), exposure=exposure)
     return reduce_frames(registered, optics)
 
 
+def _plain(counts: ArrayLike) -> ArrayLike:
+    """Counts with NaN in the place of what a masked array masks."""
+    return np.ma.filled(counts.astype(float), np.nan) if isinstance(counts, np.ma.MaskedArray) else counts
+
+
 def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | None = None) -> Measurement:
     """Bring frames on the grid of the pupil and normalise them.
 
     The amplitude is common to both images, and follows from the mean of the clear frames, each scaled to the same
-    flux. If their ratio varies smoothly over the pupil, the arms are lit differently: all images of an arm are
-    divided by its gain, the square root of that ratio or its inverse.
+    flux. If their ratio varies smoothly over the pupil, the arms are lit differently, and all images of an arm are
+    divided by its gain. Clear frames show the ratio of the gains. Both arms share it, unless the frames behind the
+    masks agree better with a gain in one arm alone, or with light that is even before the masks.
 
     A pixel that is lit in part has an area s with the amplitude A of its neighbours. With the reference wave
     r its mean intensity is s |A exp(i phi) + r|^2 + (1 - s) |r|^2, which is |s A exp(i phi) + r|^2 plus the
@@ -412,7 +423,16 @@ def reduce_frames(registered: RegisteredFrames, optics: Optics, margin: int | No
         raise ValueError(
             f"diameter = {optics.diameter:g} lambda/D: expected at most {registered.diameter:.4g} (pixels of D)"
         )
-    return reduce_with(clear_light(registered, optics.pupil_background), registered, optics, margin)
+    best = reduce_with(clear_light(registered, optics.pupil_background), registered, optics, margin)
+    least = None
+    for share in (0.0, 1.0, None):
+        clear = clear_light(registered, optics.pupil_background, share)
+        if np.ptp(clear.gain, axis=(1, 2)).max() > UNEVEN:
+            least = least or _rough_misfit(best)
+            rival = reduce_with(clear, registered, optics, margin)
+            if (error := _rough_misfit(rival)) < _SURELY * least:
+                best, least = rival, error
+    return best
 
 
 class ClearLight(NamedTuple):
@@ -424,23 +444,24 @@ class ClearLight(NamedTuple):
     counts: NDArray[np.float64]  # (2,), see `Measurement`
     background: NDArray[np.float64]  # (4,), see `Measurement`
     gain: NDArray[np.float64]  # (2, ny, nx), of the arms
+    share: float | None  # see `Measurement`
 
 
-def clear_light(registered: RegisteredFrames, pupil_background: float) -> ClearLight:
+def clear_light(registered: RegisteredFrames, pupil_background: float, share: float | None = 0.5) -> ClearLight:
     """Amplitude of the pupil, and units of the frames, from the clear frames alone."""
     n, center = registered.n_pixels, registered.center
     clear, bad = registered._on_grid(CLEAR_FRAMES)
     background = _backgrounds(registered) if registered.background else np.zeros(4)
     stop = radius((n, n), center) <= registered.diameter / 2
     clear -= background[2:, None, None]
-    gain = _gains(clear, stop & ~bad.any(axis=0), center, registered.diameter)
+    gain = gains(clear, stop & ~bad.any(axis=0), center, registered.diameter, share)
     light, scale = mean_light(clear / gain, stop)
     light = np.where(stop, np.maximum(light - pupil_background, 0), 0)
     amplitude = _amplitude(light, registered.diameter)
     pupil = Pupil.from_amplitude(amplitude, registered.diameter, center, _DARK)
     unit = float(np.mean(amplitude[pupil.inside] ** 2))
     rest = np.where(pupil.inside, light / unit - pupil.amplitude**2, 0)
-    return ClearLight(pupil, rest, bad.any(axis=0) & pupil.inside, scale * unit, background, gain)
+    return ClearLight(pupil, rest, bad.any(axis=0) & pupil.inside, scale * unit, background, gain, share)
 
 
 def reduce_with(clear: ClearLight, registered: RegisteredFrames, optics: Optics, margin: int) -> Measurement:
@@ -468,33 +489,8 @@ def reduce_with(clear: ClearLight, registered: RegisteredFrames, optics: Optics,
     around = (0, 0), (margin, margin), (margin, margin)
     return Measurement(
         registered, optics, intensity, pupil, clear.rest, bad, margin, counts, clear.background, ratio,
-        np.pad(clear.gain, around, "edge"),
+        np.pad(clear.gain, around, "edge"), clear.share,
     )  # fmt: skip
-
-
-def _gains(images: NDArray, inside: NDArray, center: tuple[float, float], diameter: float) -> NDArray[np.float64]:
-    """Gains of two arms, (2, ny, nx), whose product is 1 and whose ratio is that of their clear frames.
-
-    The logarithm of the ratio is a polynomial in the pupil, and constant along a ray beyond it. Coefficients of
-    orthonormal polynomials shrink by their noise, to 0 below 3 standard errors.
-    """
-    mean = np.where(inside, images.mean(axis=0), 0)
-    lit = ndimage.binary_erosion(mean > np.median(mean[inside]) / 2, np.ones((3, 3)), NEAR)
-    lit &= (images > 0).all(axis=0)
-    rows, columns = (np.indices(lit.shape) - np.reshape(center, (2, 1, 1))) * 2 / diameter
-    beyond = np.maximum(np.hypot(rows, columns), 1)
-    powers = [(i, j) for i in range(_DEGREE + 1) for j in range(_DEGREE + 1 - i)]
-    terms = np.stack([(rows / beyond) ** i * (columns / beyond) ** j for i, j in powers], axis=-1)
-    if np.count_nonzero(lit) < 4 * len(powers):
-        return np.ones_like(images)
-    ratio = np.log(images[1, lit] / images[0, lit])
-    basis, triangle = np.linalg.qr(terms[lit])
-    coefficients = basis.T @ ratio
-    noise = 1.48 * np.median(np.abs(ratio - basis @ coefficients))  # robust standard deviation
-    coefficients *= np.maximum(1 - (_CERTAIN * noise) ** 2 / np.maximum(coefficients**2, 1e-300), 0)
-    coefficients[0] = 0  # the scale of each image is measured apart
-    half = terms @ np.linalg.solve(triangle, coefficients) / 2
-    return np.exp([-half, half])
 
 
 def _fully_lit(amplitude: NDArray, diameter: float, least: float, apart: int) -> NDArray[np.bool_]:
@@ -605,13 +601,11 @@ def upside_down(measurement: Measurement) -> Measurement:
 
 def doubt(measurement: Measurement, phase: NDArray) -> str:
     """Say that frames do not belong to their model with a phase (ny, nx); empty if they do, off the edges."""
-    agreement, far = measurement.agreement(phase), measurement.good & ~near_edges(measurement)
+    far = measurement.good & ~near_edges(measurement)
     if not far.any():
         return ""
-    measured, modelled = (
-        frames[(..., *measurement.window)] for frames in (agreement.measured, agreement.modelled)
-    )
-    residual = float(np.sqrt(np.mean((measured - modelled)[:, far] ** 2)))
+    residual = _misfit_far(measurement, phase)
+    measured = measurement.measured[(..., *measurement.window)]
     rough = [ndimage.convolve(frame, np.outer(_SECOND, _SECOND) / 6, mode="nearest") for frame in measured]
     noise = 1.48 * np.median(np.abs(rough)[:, far])
     if residual < max(_DOUBTFUL, _UNLIKE * noise):
@@ -620,6 +614,17 @@ def doubt(measurement: Measurement, phase: NDArray) -> str:
         f"The frames differ from their model by {residual:.2g} of the mean light, and noise explains {noise:.2g}: "
         "look at exposure, dark, the order and the orientation of the images, and bad pixels."
     )
+
+
+def _misfit_far(measurement: Measurement, phase: NDArray) -> float:
+    """Rms difference of frames and model with a phase (ny, nx), far from edges; infinite if there are none."""
+    agreement, far = measurement.agreement(phase), measurement.good & ~near_edges(measurement)
+    missing = (agreement.measured - agreement.modelled)[(..., *measurement.window)][:, far]
+    return float(np.sqrt(np.mean(missing**2))) if far.any() else np.inf
+
+
+def _rough_misfit(measurement: Measurement) -> float:
+    return _misfit_far(measurement, iterated_phase(measurement, _ROUGHLY, 1e-3))
 
 
 def _backgrounds(registered: RegisteredFrames) -> NDArray[np.float64]:

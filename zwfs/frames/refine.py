@@ -147,7 +147,7 @@ class _Search:
         # Few trials change the clear frames: only the last of the images is one.
         of_clear = shifts[2:].tolist(), optics.pupil_background
         if of_clear != self._clear[0]:
-            self._clear = of_clear, clear_light(registered, optics.pupil_background)
+            self._clear = of_clear, clear_light(registered, optics.pupil_background, self.before.share)
         return reduce_with(self._clear[1], registered, optics, self.margin)
 
     def _residuals(self, unknowns: NDArray) -> NDArray[np.float64]:

@@ -18,7 +18,7 @@ from scipy import ndimage
 
 from zwfs import _check
 from zwfs._images import nearest_good, radius, turning
-from zwfs.frames._outline import Circle, Details, outline, threshold
+from zwfs.frames._outline import UNEVEN, Circle, Details, gains, outline, threshold
 
 __all__ = ["Placement", "RegisteredFrames", "register_frames"]
 
@@ -42,7 +42,8 @@ _UNLIT, _MOST_OF_IT = 0.05, 0.6  # light of a dead line over that around it, and
 _FEW_LINES = 4
 # Why an image holds one pupil, or two.
 _WHY = {
-    1: "because another image holds the other pupil, or phase_shifts has one value",
+    1: "because another image holds the other pupil, or phase_shifts has one value; with both pupils on each "
+    "exposure, set n_images = 1",
     2: "because two images are needed, with different phase shifts, and some pixels apart",
 }
 FRAMES, CLEAR_FRAMES = slice(0, 2), slice(2, 4)  # of the four images
@@ -572,11 +573,14 @@ def _register(rough: RegisteredFrames, frames_too: bool) -> RegisteredFrames:
     # The outline takes part, unless software cut it out of its surroundings.
     cut = any(image.cut for image in rough.clear_frames)
     reach = 0.45 * rough.diameter if cut else rough.diameter / 2 + _EDGE
-    reference, image = rough._on_grid(CLEAR_FRAMES, _AROUND)[0]
+    images, bad = rough._on_grid(CLEAR_FRAMES, _AROUND)
     center = rough.center[0] + _AROUND, rough.center[1] + _AROUND
-    inside = radius(reference.shape, center) <= reach
+    inside = radius(images.shape[1:], center) <= reach
+    gain = gains(images, inside & ~bad.any(axis=0), center, rough.diameter)
+    if np.ptp(gain[1]) > UNEVEN:  # the edge of unevenly lit arms looks moved and stretched
+        images = images / gain
     ratio = second.diameter / first.diameter
-    placement = register(image, reference, inside, center, turn=True, magnification=ratio)
+    placement = register(images[1], images[0], inside, center, turn=True, magnification=ratio)
     if abs(placement.rotation) > _LARGEST_TURN or abs(placement.magnification - 1) > _LARGEST_STRETCH:
         raise ValueError(
             f"the second image is rotated by {placement.rotation:.1f} degrees and magnified by "

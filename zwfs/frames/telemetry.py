@@ -27,7 +27,7 @@ from zwfs.frames._follow import checked_follow
 from zwfs.frames._part import Cards, Part, Unit
 from zwfs.frames._stack import Stack
 from zwfs.frames.calibration import Calibration
-from zwfs.frames.files import check_output, sensor_cards
+from zwfs.frames.files import SHORTEST, check_output, sensor_cards
 from zwfs.frames.phases import Flag, Phases
 from zwfs.modes import zernike_basis
 
@@ -107,7 +107,7 @@ def reconstruct(
         see `Calibration.sigma`. It takes several times as long as the phases.
     read_noise : float, electrons rms / pixel
     wavelength : float, nm, optional
-        For the header, which then holds the nm of a radian; by default WAVELEN of the first file if it is above 0.
+        For the header, which then holds the nm of a radian; by default WAVELEN of the first file if above 10.
     keywords : sequence of str
         Keywords of the headers that become columns of the table; each file must have them.
     saturation : float, counts, optional
@@ -212,7 +212,7 @@ class _Job:
             raise ValueError(f"read_noise = {read_noise:g}: expected a number of photons with it")
         if wavelength is not None:
             wavelength = _check.number("wavelength", wavelength, 0, open_low=True)
-        elif isinstance(stated := stack.header.get("WAVELEN"), int | float) and 0 < stated < np.inf:
+        elif isinstance(stated := stack.header.get("WAVELEN"), int | float) and SHORTEST < stated < np.inf:
             wavelength = stated  # the phases need none, so any other value is left alone
         level = calibration.saturation if saturation is None else saturation
         if saturation is None and level == np.inf:

@@ -16,9 +16,9 @@ from zwfs import _check
 from zwfs._images import nearest_good
 from zwfs._results import Result
 from zwfs.bounds import cramer_rao
+from zwfs.frames._outline import NEAR
 from zwfs.frames.phases import Phases
 from zwfs.frames.pipeline import (
-    NEAR,
     Agreement,
     Measurement,
     Optics,

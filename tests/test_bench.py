@@ -173,30 +173,6 @@ def test_focus_difference_is_free_space_to_either_side(perfect, commands, distan
     assert unlike > 50 * distance
 
 
-def talbot_contrasts(q, f, **planes):
-    """Contrast along x and y of a phase grating of amplitude q and frequency f in each clear frame, (2, 2)."""
-    open_pupil = {"n_rings": 0, "missing": (), "illumination": 0} | planes
-    graved, plain = (ideal(**open_pupil, quilting=value).clear_frames() for value in (q, 0))
-    x, y = np.meshgrid(LAYOUT.x, LAYOUT.x)
-    centre = np.hypot(x, y) < 0.25
-    waves = np.stack([np.cos(2 * np.pi * f * x), np.cos(2 * np.pi * f * y), np.ones_like(x)])[:, centre]
-    return np.linalg.lstsq(waves.T, inner(graved - plain)[:, centre].T)[0][:2].T
-
-
-@pytest.mark.parametrize(
-    ("planes", "along"),  # along x and y, for each image
-    [
-        ({"focus_difference": 3e-4}, [[1.5e-4] * 2, [-1.5e-4] * 2]),
-        ({"focus_difference": 1e-3}, [[5e-4] * 2, [-5e-4] * 2]),
-    ],
-)
-def test_defocus_turns_a_phase_grating_into_contrasts(planes, along):
-    # Talbot: exp(i q cos(2 pi f x)) becomes 1 + 2 q sin(pi z f^2) cos(2 pi f x) in intensity, for a small q.
-    q, f = 0.01, 22
-    expected = 2 * q * np.sin(np.pi * np.array(along) * f**2)
-    np.testing.assert_allclose(talbot_contrasts(q, f, **planes), expected, rtol=0.05)
-
-
 def test_dimple_error_changes_the_dimple_only(perfect, commands):
     bench = ideal(dimple_error=0.25)
     np.testing.assert_array_equal(bench.clear_frames(), perfect.clear_frames())

@@ -26,11 +26,6 @@ def calibration(recording):
     return study.calibrate(recording)
 
 
-@pytest.fixture(scope="module")
-def measured(recording, calibration):
-    return study.measure_inputs(recording, calibration, 0.3, 1)
-
-
 def test_recorded_frames_are_those_that_the_script_makes(recording):
     assert calibration_frames.FILE.stat().st_size < 600e3
     arrays = calibration_frames.made()
@@ -46,16 +41,6 @@ def test_shorter_exposures_have_the_light_of_the_calibration_and_more_noise(reco
     (light, noise), (same, more) = (recording.shot(number) for number in (bright, faint))
     assert same.sum() == pytest.approx(light.sum(), rel=0.05)  # of another screen
     assert np.median(more) > 10 * np.median(noise)
-
-
-def test_fit_recovers_the_bench(recording, calibration):
-    fit = calibration.bench
-    for name, value in study.known_values(recording).items():
-        if name in ("diameter", "first", "second"):
-            assert fit[name].value == pytest.approx(value, rel=5e-3), name
-        elif name.endswith(("row", "column", "leakage")):
-            assert fit[name].value == pytest.approx(value, abs=0.02), name
-    assert fit.consistent
 
 
 def test_saved_calibration_keeps_its_fit(tmp_path, recording, calibration):
@@ -75,26 +60,6 @@ def test_saved_calibration_keeps_its_fit(tmp_path, recording, calibration):
 def test_verdict_shows_commands_that_are_wrong_by_three_percent(recording, error, consistent):
     wrong = {**recording.arrays, "commands": (1 + error) * recording.arrays["commands"]}
     assert study.calibrate(replace(recording, arrays=wrong)).bench.consistent == consistent
-
-
-def test_calibrated_phases_are_better_than_those_of_the_design_and_their_error_bars_hold(measured):
-    assert measured.rms.tolist() == [0.1, 0.3]
-    assert np.all(measured.column("calibrated") < 0.75 * measured.column("plain"))
-    assert measured.column("calibrated").max() < 0.02
-    for [screen] in measured.measured:
-        assert 0.5 < screen.inside < 0.9
-        assert screen.consistent
-
-
-def test_frames_of_a_different_bench_are_flagged(recording, calibration):
-    [number] = recording.unseen(0.3, recording.photons[0])[:1]
-    frames = recording.arrays["unseen_frames"].copy()
-    frames[number, 1] = frames[number, 1, ::-1]
-    [[screen]] = study.measure(
-        replace(recording, arrays={**recording.arrays, "unseen_frames": frames}), calibration, [[number]]
-    )
-    assert not screen.consistent
-    assert screen.misfit > 10
 
 
 @pytest.mark.parametrize("mirrored", [False, True])

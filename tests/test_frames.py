@@ -12,7 +12,7 @@ from zwfs.bench import bench_error, write_bench
 from zwfs.bench.model import Bench, BenchModel, segment_residual, segment_screens
 from zwfs.frames import Calibration
 from zwfs.frames import files as camera
-from zwfs.frames.pipeline import Optics, phase_of, predict_other, recover_phase, reduce_frames
+from zwfs.frames.pipeline import Optics, phase_of, recover_phase, reduce_frames
 from zwfs.frames.refine import fit, steps
 from zwfs.frames.registration import (
     Image,
@@ -139,17 +139,6 @@ def test_stacked_pupils_and_given_centers(recorded):
 # Measurement
 
 
-def test_phase_is_recovered(recorded, screen):
-    _, masked, bare = recorded
-    registered = register_frames([image(masked)], [image(bare)])
-    phases = recover_phase(reduce_frames(registered, Optics()))
-    # Blur and interpolation, which the model knows nothing of, leave most of it, at the gaps.
-    assert error(phases, registered, screen) < 0.1
-    assert phases.agreement.correlation.min() > 0.97
-    worse = register_frames([image(masked)], [image(bare)], subpixel=False)
-    assert error(recover_phase(reduce_frames(worse, Optics())), worse, screen) > error(phases, registered, screen)
-
-
 def test_background_and_flux_are_measured(recorded):
     pupil, masked, bare = recorded
     measurement = reduce_frames(register_frames([image(masked)], [image(bare)]), Optics())
@@ -200,17 +189,6 @@ def test_balance_gives_both_frames_the_same_light_in_the_pupil(recorded, balance
     )
     light = measurement.intensity[(..., *measurement.window)][:, measurement.good].mean(axis=1)
     assert light[0] / light[1] == pytest.approx(1 if balance else 1 / 0.9, rel=1e-12 if balance else 0.02)
-
-
-def test_exchanged_phase_shifts_change_the_sign(recorded):
-    _, masked, bare = recorded
-    registered = register_frames([image(masked)], [image(bare)])
-    optics = Optics()
-    estimate = recover_phase(reduce_frames(registered, optics))
-    swapped = replace(optics, phase_shifts=optics.phase_shifts[::-1])
-    exchanged = recover_phase(reduce_frames(registered, swapped))
-    np.testing.assert_allclose(np.nan_to_num(exchanged.phase), -np.nan_to_num(estimate.phase), atol=1e-5)
-    np.testing.assert_allclose(exchanged.agreement.correlation, estimate.agreement.correlation, atol=1e-6)
 
 
 def test_masked_pixels_are_left_out_and_do_little_harm(recorded, screen):
@@ -282,21 +260,6 @@ def test_fit_leaves_a_clear_image_where_registration_is_sure_of_it(recorded):
     assert optics.scale == pytest.approx(1, abs=0.05)
     assert not np.array_equal(refined.origins[:2], registered.origins[:2])
     np.testing.assert_array_equal(refined.origins[2:], registered.origins[2:])
-
-
-def test_prediction_tells_a_pair_from_a_mere_juxtaposition(recorded):
-    _, masked, bare = recorded
-    left, right = np.hsplit(masked, 2)
-    scores = []
-    for frame in (masked, np.hstack([left, right[::-1]])):
-        measurement = reduce_frames(register_frames([image(frame)], [image(bare)]), Optics())
-        scores.append((predict_other(measurement).min(),
-                       recover_phase(measurement).agreement.correlation.min()))  # fmt: skip
-    (right_pair, correlation), (wrong_pair, spurious) = scores
-    assert right_pair > 0.9
-    assert wrong_pair < 0.7
-    assert spurious > wrong_pair  # the iteration explains much of what makes no sense
-    assert correlation > spurious
 
 
 # Order of the images

@@ -13,7 +13,7 @@ from zwfs.frames.pipeline import (
     upside_down,
 )
 from zwfs.frames.refine import fit, steps
-from zwfs.frames.registration import FRAMES, Image, Placement, RegisteredFrames, register_frames
+from zwfs.frames.registration import register_frames
 from zwfs.frames.verdict import CameraNoise, _of_score, judge
 
 from .hcipy_bench import HcipyBench
@@ -137,28 +137,3 @@ def test_photons_are_those_of_the_mean_of_the_clear_frames_and_their_noise_is_th
 
 
 # Places
-
-
-def test_second_image_is_turned_about_the_centre_of_its_pupil():
-    """The offset between the images comes after the rotation."""
-    shape, shift = (60, 140), np.array([3.0, 70.0])
-    rows, columns = np.indices(shape)
-    images = [Image(one.astype(float), np.zeros(shape, bool)) for one in (rows, columns)]
-    placement = Placement(shift, rotation=5.0, magnification=1.02)
-    disc = RegisteredFrames(
-        (images[0], images[0]), (images[0], images[0]), (_circle(), _circle()),
-        np.array([[0.0, 0.0], shift, [0.0, 0.0], shift]), placement=placement,
-    )  # fmt: skip
-    for axis, image in enumerate(images):
-        seen = replace(disc, frames=(image, image))._on_grid(FRAMES)[0] / disc.areas[:2, None, None]
-        middle = (29.0, 30.0)[axis]
-        np.testing.assert_allclose(seen.mean(axis=(1, 2)), [middle, middle + shift[axis]], atol=1e-6)
-        # One column to the right on the first image, on both.
-        step = np.diff(seen, axis=2).mean(axis=(1, 2))
-        np.testing.assert_allclose(step, [axis, placement.matrix[axis, 1]], atol=1e-6)
-
-
-def _circle():
-    from zwfs.frames._outline import Circle
-
-    return Circle(29.0, 30.0, 31.0)

@@ -6,9 +6,7 @@ import pytest
 import zwfs
 from zwfs import Dimple, PhaseShifted, Pupil, ZernikeSensor, reconstruction_error
 
-
-def pair(pupil, diameter=1.06):
-    return ZernikeSensor(pupil, Dimple(diameter, np.pi / 2), Dimple(diameter, -np.pi / 2))
+from .conftest import pair
 
 
 @pytest.mark.parametrize("diameter", [0.5, 1.06, 1.5, 2.0])

@@ -62,10 +62,6 @@ def make(sensor_of, modes):
     return make
 
 
-def pair(pupil, a, b, **options):
-    return ZernikeSensor(pupil, Dimple(1.06, a), Dimple(1.06, b), **options)
-
-
 def errors(reconstruct, sensor, phase):
     return reconstruction_error(sensor.pupil, reconstruct(sensor.measure(phase)).phase, phase)
 

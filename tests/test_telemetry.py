@@ -140,24 +140,6 @@ def test_longer_exposure_time_of_the_frames_changes_no_phase(bench, calibration)
     assert not estimate.flags.any()
 
 
-def test_phase_is_that_which_was_put_in(bench, calibration):
-    corner = calibration.places[0, :, 0, 0] - MARGIN
-    grid = np.rint(corner).astype(int)
-    window = slice(-grid[0], D - grid[0]), slice(-grid[1], D - grid[1])
-    for phase, screen in zip(calibration(bench.frames).phase, bench.screens, strict=True):
-        assert rms(phase[window] - screen) < 0.05
-
-
-def test_two_images_of_an_exposure_are_the_halves_of_one(bench, calibration):
-    half = bench.flat.shape[1] // 2
-    parts = [bench.image(image[:, side]) for image in (bench.flat, bench.clear)
-             for side in (slice(None, half), slice(half, None))]  # fmt: skip
-    two = Calibration.of(reduce_frames(register_frames(parts[:2], parts[2:]), Optics()))
-    frames = np.stack([bench.frames[..., :half], bench.frames[..., half:]], axis=1)
-    assert two.n_images == 2
-    assert rms(two(frames).phase - calibration(bench.frames).phase) < 0.01
-
-
 def test_calibration_is_kept_in_a_file_and_in_a_pickle(tmp_path, bench, calibration):
     calibration.save(tmp_path / "a.npz")
     loaded = Calibration.load(tmp_path / "a.npz")

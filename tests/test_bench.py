@@ -216,16 +216,6 @@ def test_static_and_quilting_add_to_the_commands(commands):
     assert abs(excess.mean()) == pytest.approx(1, abs=1e-9)
 
 
-@pytest.mark.parametrize("illumination", [0.5, 1.5])
-def test_illumination_shows_in_the_pupil_images(illumination):
-    first, second = ideal(illumination=illumination).clear_frames()
-    np.testing.assert_array_equal(first, second)
-    values = inner(first)[LAYOUT.inside]
-    slope, mean = np.polyfit(LAYOUT.points[:, 0], values, 1)
-    assert slope / mean == pytest.approx(illumination)
-    assert values.mean() == pytest.approx(1)
-
-
 # Noise
 
 

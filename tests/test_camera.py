@@ -79,7 +79,6 @@ def test_saturation_is_given_in_the_header_of_the_type_or_seen(tmp_path, counts,
 @pytest.mark.parametrize(
     ("others", "message"),
     [
-        (([FRAME[1:]],), r"dark_files: dark\.fits has shape \(19, 30\)"),
         (([FRAME] * 2,), r"dark\.fits: 2 images for the 1"),
         (([FRAME + np.nan],), r"frame\.fits, dark\.fits: all pixels are bad"),
         (((), [(FRAME != 7).astype(int)]), r"bad_pixels: map\.fits marks 99\.5% .* 1 = good"),

@@ -308,11 +308,6 @@ def test_frames_without_two_equal_pupils_are_refused(recorded):
         ValueError, match=r"expected 1, because another image holds .* or phase_shifts has one value"
     ):
         register_frames([image(masked)], [image(bare)], n_pupils=1)
-    good = np.zeros(bare.shape, bool)
-    good[40, 50] = True
-    with pytest.raises(ValueError, match="pixels are marked as bad: expected a map that is 0 where good"):
-        register_frames([image(masked)], [image(np.full(bare.shape, bare[40, 50]), bad=~good)])
-
     left, right = np.hsplit(bare, 2)
     small = ndimage.zoom(right, 0.9, order=1)
     with pytest.raises(ValueError, match=r"the two pupils are 61\.\d and 6\d\.\d pixels wide"):

@@ -292,8 +292,6 @@ def test_bad_input_is_named(tmp_path, pupil, sensor, trained):
             LearnedReference(pair(pupil, shifts=shifts))
     with pytest.raises(ValueError, match="sensor: the reference wave of a flat wavefront differs"):
         LearnedReference(pair(zwfs.Pupil.circular(40, 0.5)))
-    with pytest.raises(ValueError, match=r"training = 'sky': expected one of \['paper', 'bench'\]"):
-        LearnedReference(sensor, "sky")
     with pytest.raises(ValueError, match=r"errors.flux_ratio = .* for one mask"):
         LearnedReference.train(pair(pupil, shifts=(1.5,)), errors=BenchErrors(flux_ratio=(0.9, 1.1)))
     with pytest.raises(ValueError, match=r"sensor: masks\[1\] = Dimple.*: expected dimples of one diameter"):

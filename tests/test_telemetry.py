@@ -1,6 +1,5 @@
 """A calibrated bench and its telemetry: phases, flags, what is refused, and that no frame is lost."""
 
-import gzip
 import json
 import os
 import pickle
@@ -612,20 +611,9 @@ def test_memory_does_not_grow_with_the_cube(folder, monkeypatch, bench, calibrat
 # Kinds of files
 
 
-def scaled(path, frames):
-    """Half counts above 1000, and cards that say so: astropy would write the numbers without them."""
-    cards = {"BSCALE": 0.5, "BZERO": 1000.0, "BLANK": -(2**31)}
-    fits.PrimaryHDU((frames.astype(np.int32) - 1000) * 2).writeto(path)
-    with fits.open(path, mode="update", do_not_scale_image_data=True) as units:
-        units[0].header.update(cards)
-
-
 KINDS = {
     "cube.npy": np.save,
     "single.npy": lambda path, frames: np.save(path, frames[:, np.newaxis]),
-    "float.npy": lambda path, frames: np.save(path, frames.astype(">f8")),
-    "packed.fits": lambda path, _: path.write_bytes(gzip.compress(Path("cube.fits").read_bytes())),
-    "scaled.fits": scaled,
     "columns.npy": lambda path, frames: np.save(path, np.asfortranarray(frames)),
     "compressed.fits": lambda path, frames: fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(frames)]).writeto(
         path

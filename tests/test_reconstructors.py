@@ -45,6 +45,11 @@ def steps(method, **options):
     return options if method.iterative else {}
 
 
+def once(method):
+    """Option of a method that would try several starts."""
+    return {"n_starts": 1} if takes(method, "n_starts") else {}
+
+
 @pytest.fixture
 def sensor_of(classic, shifted):
     """Sensor for a method: two masks if it accepts them, else one."""
@@ -139,7 +144,9 @@ def test_measured_amplitude_is_used(sensor_of, modes, method, screens, pupil):
     sensor = ZernikeSensor(pupil, *sensor_of(method).masks, extent=4)  # Gerchberg-Saxton needs a wide detector
     amplitude = np.random.default_rng(0).uniform(0.7, 1.3, pupil.shape)
     frames = sensor.measure(screens(0.01), amplitude)
-    right, wrong = build(method, sensor, modes, amplitude=amplitude), build(method, sensor, modes)
+    right, wrong = (
+        build(method, sensor, modes, **once(method), **option) for option in ({"amplitude": amplitude}, {})
+    )
     assert np.all(right(frames).residual < 0.1 * wrong(frames).residual)
 
 
@@ -399,8 +406,7 @@ def test_tolerance_stops_early(make, method, screens, pupil):
 
 @iterative
 def test_start_is_where_it_starts(make, method, screens, pupil):
-    one_start = {"n_starts": 1} if takes(method, "n_starts") else {}
-    reconstruct, sensor = make(method, n_iterations=3, tolerance=0, **one_start)
+    reconstruct, sensor = make(method, n_iterations=3, tolerance=0, **once(method))
     phase = np.where(pupil.inside, 4.0 + screens(0.4), np.nan)
     frames = sensor.measure(phase)
     result = reconstruct(frames, start=phase, history=True)
@@ -512,7 +518,7 @@ def test_masks_without_diversity_are_refused(pupil, phases):
 
 @every
 def test_raw_counts_are_warned_of(make, method, screens):
-    reconstruct, sensor = make(method)
+    reconstruct, sensor = make(method, **once(method))
     counts = np.rint(100 * sensor.measure(screens(0.3, 1))).astype(int)  # whole numbers, as of a camera
     mean = counts[..., sensor.pupil.inside].mean(axis=-1).max()
     with pytest.warns(UserWarning, match=f"frames: the mean inside the pupil reaches {mean:.4g}: ") as caught:
@@ -524,8 +530,7 @@ def test_raw_counts_are_warned_of(make, method, screens):
 @pytest.mark.parametrize(("dimple", "extent"), [(Dimple(1.06, np.pi), 1.0), (Dimple(2.5, 1.0, 0.3), 1.6)])
 def test_no_frame_of_a_mask_is_taken_for_raw_counts(pupil, modes, screens, method, extent, dimple):
     sensor = ZernikeSensor(pupil, dimple, *[Dimple(1.06, -2.0)] * (method.n_masks[1] > 1), extent=extent)
-    once = {"n_starts": 1} if takes(method, "n_starts") else {}
-    reconstruct = build(method, sensor, modes, **steps(method, n_iterations=1), **once)
+    reconstruct = build(method, sensor, modes, **steps(method, n_iterations=1), **once(method))
     phase = np.concatenate([screens(rms, 1) for rms in (0.0, 0.5, 3.0)])
     rng = np.random.default_rng(0)
     with warnings.catch_warnings():
@@ -536,7 +541,7 @@ def test_no_frame_of_a_mask_is_taken_for_raw_counts(pupil, modes, screens, metho
                 frames = (rng.poisson(frames * photons) + rng.normal(0, 3, frames.shape)) / photons
             reconstruct(frames)
         if method.iterative:
-            bright = build(method, sensor, modes, n_iterations=1, amplitude=100 * pupil.amplitude, **once)
+            bright = build(method, sensor, modes, n_iterations=1, amplitude=100 * pupil.amplitude, **once(method))
             bright(1e4 * sensor.measure(phase))
 
 

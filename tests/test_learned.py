@@ -97,6 +97,12 @@ def test_simulated_leakage_and_light_act_on_the_images(pupil, sensor):
     assert np.abs(frames[0] - expected)[:, pupil.inside].max() < 2e-4
 
 
+def test_random_screens_have_unit_rms_and_are_independent(pupil):
+    values = random_screens(pupil, 6, np.random.default_rng(2))[:, pupil.inside]
+    assert values.std(axis=1) == pytest.approx(1, abs=1e-4)
+    assert np.abs(np.corrcoef(values) - np.eye(6)).max() < 0.8
+
+
 def test_one_solve_reaches_the_noise_of_the_iteration(pupil, sensor):
     truth = screens_of(pupil, 0.8, 60, seed=7)
     frames = np.random.default_rng(3).poisson(1000 * sensor.measure(truth)) / 1000

@@ -28,14 +28,15 @@ from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens, wri
 from zwfs.bench.model import segment_pistons
 from zwfs.frames import BenchFit, Calibration, pipeline, reconstruct, recover_phase
 from zwfs.frames.files import read_all
+from zwfs.frames.refine import steps
 from zwfs.frames.registration import register_frames
 from zwfs.loop import LoopRecord
 from zwfs.masks import focal_field
 from zwfs.reconstructors.base import Reconstructor
-from zwfs.reconstructors.learned import BenchValues
+from zwfs.reconstructors.learned import BenchErrors, BenchValues
 from zwfs.turbulence import FrozenFlow, turbulent_screens
 
-from .conftest import needs_modes
+from .conftest import needs_modes, pair
 
 # What simulates a sensor and reconstructs a phase. Most tests of camera frames are in other files.
 MODULES = (
@@ -533,7 +534,39 @@ def looped(**changes):
     return zwfs.close_loop(SENSOR, reconstructor=zwfs.PhaseShifted(SENSOR), **arguments)
 
 
+def learnt(shifts=(np.pi / 2, -np.pi / 2), diameter=1.06, pupil=None, **options):
+    return zwfs.LearnedReference(pair(pupil or zwfs.Pupil.circular(12), diameter, shifts), **options)
+
+
+def taught(shifts=(np.pi / 2, -np.pi / 2), **settings):
+    return zwfs.LearnedReference.train(pair(PUPIL, shifts=shifts), **settings)
+
+
+def designed(**question):
+    return zwfs.design_sensor(**{"error_nm": 5, "input_nm": 20, "wavelength_m": 635e-9, "n_modes": 6} | question)
+
+
+def looked(frames, dark=None):
+    return pipeline.phase_of(frames, np.ones((2, 10, 10)), dark)
+
+
+def registered(**settings):
+    return register_frames(*camera()[:2], **settings)
+
+
+def linear():
+    return zwfs.Linear(sensor := camera()[-1].sensor, zwfs.zernike_basis(sensor.pupil, 3))
+
+
+def controlled(**settings):
+    return camera()[-1].controller(*[np.zeros(camera()[-1].shape)] * 3, **settings)
+
+
 FLAT, MODES = np.zeros((8, 8)), zwfs.zernike_basis(PUPIL, 4)
+UNTEACHABLE = {
+    "n_screens": 10, "photons": (0, 1), "read_noise": -1, "seed": -1, "progress": 5, "n_iterations": 0,
+    "errors": (0, 1), "screens": np.ones((2, 3, 3)), "amplitude": np.ones(3), "tolerance": -1,
+}  # fmt: skip
 ONES, WHOLE, WIDE = np.ones((4, 4)), np.ones((4, 4), int), zwfs.Pupil.from_amplitude(np.ones((9, 9)))
 POINTS, FOUR = np.ones(zwfs.Pupil.circular(4).n_points), zwfs.Pupil.circular(4)
 GLASS, CLEAR = zwfs.Patch(1, lambda u, v: np.exp(1j * u)), zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1, 0))
@@ -687,6 +720,70 @@ REFUSED |= {
     "stroke = 0": lambda: looped(stroke=0.0),
     "disturbance is empty": lambda: looped(disturbance=[]),
     "disturbance.1. has shape": lambda: looped(disturbance=[FLAT, np.zeros((2, 8, 8))]),
+    # a learned reference wave
+    "of 1.06 lambda/D and 1.571 rad: expected .* the training": lambda: learnt((np.pi / 2,)),
+    "1.06 lambda/D and 2 rad, .* the training": lambda: learnt((2.0, -1.0)),
+    "and -1.5 rad: expected .* the training": lambda: learnt((1.0, 2.5, -1.5)),
+    "dimples of 1.4 lambda/D .*: expected 1.06": lambda: learnt(diameter=1.4),
+    "wave of a flat wavefront differs": lambda: learnt(pupil=zwfs.Pupil.circular(12, 0.5)),
+    r"bench.phase_shift has shape \(3,\)": lambda: learnt(bench=BenchValues(0, 1, 0, np.zeros(3), 0, 0)),
+    r"frames has shape \(12, 12\): expected \(2, 12, 12\)": lambda: learnt().look()(np.ones((12, 12))),
+    "frames has dtype complex128": lambda: learnt().look()(np.ones((2, 12, 12), complex)),
+    "out is .*: expected an array of float32": lambda: learnt().look()(np.ones((2, 12, 12)), np.empty((12, 12))),
+    "bench = None: expected known errors of the bench": lambda: learnt(training="bench").look(),
+    r"masks\[1\] = Dimple.*: expected dimples of one diameter": lambda: zwfs.LearnedReference(
+        zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1.06, 1.5), zwfs.Dimple(1.2, -1.5))
+    ),
+    r"leakage = \(0.1, 0.0\): expected a smallest and a largest": lambda: BenchErrors(leakage=(0.1, 0.0)),
+    "errors.flux_ratio = .* for one mask": lambda: taught((1.5,), errors=BenchErrors(flux_ratio=(0.9, 1.1))),
+    "errors.leakage = .* for 3": lambda: taught((1.0, 2.0, -1.0), errors=BenchErrors(leakage=(0.0, 0.1))),
+    r"screens\[1\] is constant": lambda: taught(screens=[MODES[0], FLAT]),
+    r"rms = \(1.0, 1.0\): expected": lambda: taught(rms=(1, 1)),
+    **{f"^{name}": lambda name=name: taught(**{name: UNTEACHABLE[name]}) for name in UNTEACHABLE},
+    # a designed sensor
+    r"wavelength_m = 635.0: expected a finite number in \[1e-10, 0.01\]": lambda: designed(wavelength_m=635.0),
+    r"error_nm = 100: expected .* 63.5\]": lambda: designed(error_nm=100),
+    r"input_nm = 700: expected .* 635\]": lambda: designed(input_nm=700),
+    r"diameters = \(2.0, 1.0\): expected the smaller one first": lambda: designed(diameters=(2.0, 1.0)),
+    "zero_point = 1.*: expected frame_rate_hz and diameter_m, too": lambda: designed(zero_point=1e10),
+    # camera frames
+    r"frames has shape \(3, 10, 10\): .* or \(2, ny, nx\)": lambda: looked(np.ones((3, 10, 10))),
+    r"dark has shape \(3, 3\): expected \(2, 10, 10\)": lambda: looked(np.ones((2, 10, 10)), np.ones((3, 3))),
+    r"expected \(row, column\) of each of two pupils": lambda: registered(pupil_centers=[[45, 45]]),
+    "pupil_centers without a pupil_diameter": lambda: registered(pupil_centers=[[45, 45], [45, 137]]),
+    "cut off at the top": lambda: registered(pupil_centers=[[10, 25], [25, 79]], pupil_diameter=40),
+    "pupil_diameter = 7.9: expected": lambda: registered(pupil_diameter=7.9),
+    "pupil_diameter = 400: expected": lambda: registered(pupil_diameter=400),
+    "exposure = 0: expected": lambda: registered(exposure=0),
+    "^diameter = 0: expected": lambda: pipeline.Optics(0),
+    r"phase_shifts = \(1.5, 7.78": lambda: pipeline.Optics(phase_shifts=(1.5, 1.5 + 2 * np.pi)),
+    r"phase_shifts = \(0.0, 1.0\)": lambda: pipeline.Optics(phase_shifts=(0.0, 1.0)),
+    "leakage = 0.5: expected": lambda: pipeline.Optics(leakage=0.5),
+    "masks holds a str: expected masks": lambda: pipeline.Optics(masks=("ring",)),
+    r"fitted = \['colour'\]: expected": lambda: steps(*camera()[:2], pipeline.Optics(), ["colour"]),
+    "fitted = .* each name once": lambda: steps(*camera()[:2], pipeline.Optics(), ["scale", "scale"]),
+    "fitted = 'scale': expected a list": lambda: steps(*camera()[:2], pipeline.Optics(), "scale"),
+    # frames of known commands
+    "phases holds 1 state": lambda: fitted(phases=np.zeros((1, 8, 8)), frames=np.ones((1, 2, 8, 8))),
+    "one for each state": lambda: fitted(phases=np.zeros((3, 8, 8))),
+    "even differences": lambda: fitted(phases=np.ones((2, 7, 7))),
+    "clear_frames has shape": lambda: fitted(clear_frames=np.ones((2, 6, 6))),
+    "clear_frames hold .* expected light": lambda: fitted(clear_frames=np.zeros((2, 8, 8))),
+    "noise = 0": lambda: fitted(noise=0.0),
+    r"noise = 1e\+200": lambda: fitted(noise=1e200),
+    r"gain = 1e\+200": lambda: fitted(gain=1e200),
+    "diameter = 1000000000": lambda: fitted(diameter=1e9),
+    "frames has 3 images": lambda: fitted(frames=np.ones((2, 3, 8, 8))),
+    # a call of a calibration
+    r"counts has shape \(3, 10, 10\): expected \(\.\.\., 52, 104\)": lambda: camera()[-1](np.zeros((3, 10, 10))),
+    "method has another sensor": lambda: called(method=zwfs.PhaseShifted(SENSOR)),
+    "method is a str: expected a Reconstructor": lambda: called(method="linear"),
+    "start with method = Linear": lambda: called(start=np.zeros(camera()[-1].good.shape), method=linear()),
+    "poke = 0: expected": lambda: controlled(poke=0),
+    "gain = 3: expected": lambda: controlled(gain=3),
+    "rcond = 1: expected": lambda: controlled(rcond=1),
+    r"method = 'fast': expected one of \['linear'": lambda: controlled(method="fast"),
+    "n_iterations = 0: expected at least 1": lambda: controlled(n_iterations=0),
     # the simulated bench
     "phase is NaN all over a segment": lambda: segment_pistons(np.full((4, 4), np.nan), WHOLE, np.array([1])),
     "pistons and commanded have shapes": lambda: segment_residual([0.0, 1], [0.0, 1, 2]),

@@ -171,22 +171,6 @@ def test_noise_is_that_of_the_photons():
 
 
 @pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"obstruction": 1.2}, "pupil.obstruction = 1.2"),
-        ({"obstuction": 0.2}, "'pupil.obstuction' of kind 'circular': did you mean 'obstruction'"),
-        ({"kind": "keck", "missing": [1, 0]}, r"pupil.missing\[1\] = 0"),
-        ({"kind": "kek"}, "pupil.kind = 'kek'"),
-        ({"vanes": [[0.0, "a"]]}, r"pupil.vanes\[0\]\[1\] = 'a'"),
-        ([], r"pupil = \[\]"),
-    ],
-)
-def test_a_bad_nested_value_is_refused_with_its_path(values, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        check_parameters({"pupil": values}, pupil=STUDIES["fig03_dynamic_range"].LIMITS["pupil"])
-
-
-@pytest.mark.parametrize(
     ("figure", "settings", "message"),
     [
         ("3", ["n_pixels=16", "n_modes=300"], "n_modes = 300: expected at most 207 with the 208 points of pupil"),

@@ -16,6 +16,7 @@ from zwfs.frames import Calibration, pipeline, reconstruct, registration
 from zwfs.frames.__main__ import main
 from zwfs.frames._calibrate import _read_states, _windows
 from zwfs.frames._fit import fit_bench
+from zwfs.frames._solver import MapPrior
 from zwfs.frames.phases import Flag
 
 from .hcipy_bench import HcipyBench
@@ -166,6 +167,18 @@ def test_command_calibrates_with_known_commands(files, command, estimate):
     np.testing.assert_allclose(fits.getdata(files / "phase.fits"), estimate.phase, atol=0.05)
 
 
+def test_saved_calibration_keeps_its_fit(tmp_path, recorded, calibration):
+    calibration.save(tmp_path / "bench.npz")
+    loaded = Calibration.load(tmp_path / "bench.npz")
+    assert (loaded.sha256, loaded.bench.estimates) == (calibration.sha256, calibration.bench.estimates)
+    assert loaded.bench.consistent == calibration.bench.consistent
+    counts = wide(recorded.unseen[0])
+    result, expected = (road(counts, smooth=MapPrior(0.3, 4.0)) for road in (loaded, calibration))
+    np.testing.assert_array_equal(result.phase, expected.phase)
+    loaded.bench.save(tmp_path / "fit.fits")
+    assert "MODEL SHAPE 0" not in fits.getheader(tmp_path / "fit.fits")
+
+
 KINDS = {
     "cube of pairs": lambda frames: {"frames.npy": frames},
     "two cubes": lambda frames: {"first.npy": frames[:, 0], "second.npy": frames[:, 1]},
@@ -212,30 +225,6 @@ def test_states_that_do_not_belong_together_are_named(tmp_path, settings, messag
         Calibration.from_files(
             [frames], [clear], commands=commands, pupil_centers=[(9.5, 11.5)] * 2, pupil_diameter=12.0, **settings
         )
-
-
-@pytest.mark.slow
-def test_turned_pupil_of_a_telescope():
-    """On all fully lit pixels, and next to no edge, where the error bars hold."""
-    recorded = Recorded(12, 4, 0.5, aperture="VLT", pixels=40, side=52)
-    calibration = recorded.calibration(n_steps=4, oversampling=2)
-    estimate = calibration(np.where(recorded.bad, np.nan, recorded.unseen))
-    assert np.count_nonzero(estimate.flags) <= 2  # the screens have finer modes than the commands
-    errors, lit = recorded.errors(estimate.phase), recorded.bench.fully_lit
-    inner = ndimage.binary_erosion(lit)
-    assert rms(errors, lit) < 0.02
-    assert rms(errors, inner) < 0.012
-    photons, noise = calibration.unit.mean(), recorded.bench.noise
-    points = errors / calibration.sigma(estimate, photons, noise)
-    assert 0.8 < rms(points, inner) < 1.3
-    modes = zernike_basis(calibration.sensor.pupil, 50)
-    # A mode also has values at pixels of the rim. There the true phase is unknown: its mean includes zeros.
-    dark = np.pad((recorded.phases == 0).all(axis=0), 1, constant_values=True)
-    certain = calibration.good & ~ndimage.binary_dilation(dark, np.ones((3, 3)))[1:-1, 1:-1]
-    errors = np.where(certain, np.nan_to_num(errors - np.nanmean(errors[:, lit])), 0)
-    coefficients = calibration.sensor.pupil.gather(errors) @ calibration.modal_matrix(modes)
-    ratio = coefficients / calibration.sigma(estimate, photons, noise, modes)
-    assert 0.8 < np.median(np.sqrt(np.mean(ratio**2, axis=1))) < 1.3
 
 
 def test_linear_method_measures_small_screens_on_a_fitted_bench(recorded, calibration):

@@ -191,22 +191,6 @@ def test_balance_gives_both_frames_the_same_light_in_the_pupil(recorded, balance
     assert light[0] / light[1] == pytest.approx(1 if balance else 1 / 0.9, rel=1e-12 if balance else 0.02)
 
 
-def test_masked_pixels_are_left_out_and_do_little_harm(recorded, screen):
-    _, masked, bare = recorded
-    rng = np.random.default_rng(5)
-    bad = rng.random(masked.shape) < 0.01
-    spoilt = np.where(bad, 0.0, masked)
-    registered = register_frames([image(spoilt, bad=bad)], [image(bare)])
-    measurement = reduce_frames(registered, Optics())
-    estimate = recover_phase(measurement)
-    # Each one spoils up to four points of the grid, in one image or the other.
-    assert 60 < measurement.n_bad < 500
-    assert np.count_nonzero(np.isfinite(estimate.phase)) == measurement.pupil.n_points - measurement.n_bad
-    clean = register_frames([image(masked)], [image(bare)])
-    best = error(recover_phase(reduce_frames(clean, Optics())), clean, screen)
-    assert error(estimate, registered, screen) < best + 0.02
-
-
 def test_leakage_and_unmasked_light_are_undone(screen):
     pupil, *_ = pair()
     optics = Optics(leakage=0.1, unmasked=0.2)

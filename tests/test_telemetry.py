@@ -128,6 +128,13 @@ def test_phase_is_that_of_the_plain_iteration_in_double_precision(bench, optics,
     assert not estimate.flags.any()
 
 
+def test_calibration_needs_no_flat_mirror(bench, calibration):
+    aberrated = register_frames([bench.image(bench.frames[0])], [bench.image(bench.clear)])
+    recalibrated = Calibration.of(reduce_frames(aberrated, Optics()), saturation=65535)
+    np.testing.assert_array_equal(recalibrated.places[0, :, 0, 0].round(), calibration.places[0, :, 0, 0].round())
+    assert rms(recalibrated(bench.frames).phase - calibration(bench.frames).phase) < 0.03
+
+
 def test_longer_exposure_time_of_the_frames_changes_no_phase(bench, calibration):
     def longer(counts):
         return 3.0 * counts - 2 * DARK

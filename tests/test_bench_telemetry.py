@@ -11,8 +11,7 @@ from astropy.io import fits
 from scipy import ndimage
 
 from zwfs import Linear, zernike_basis
-from zwfs._images import nearest_good
-from zwfs.frames import Calibration, pipeline, reconstruct, registration
+from zwfs.frames import Calibration, reconstruct
 from zwfs.frames.__main__ import main
 from zwfs.frames._calibrate import _read_states, _windows
 from zwfs.frames._fit import fit_bench
@@ -44,26 +43,9 @@ class Recorded:
         settings |= {"n_pixels": bench.pixels, "noise": bench.noise}
         return Calibration.fit(self.frames, self.clear, self.phases, **settings)
 
-    def quick(self, frame=None):
-        """The calibration from one frame (the flat) alone, and the place of its grid on that of the truth."""
-        frame = self.frames[0] if frame is None else frame
-
-        def image(counts, bad):
-            return registration.Image(nearest_good(counts, ~bad), bad)
-
-        pairs = [list(map(image, pair, self.bad)) for pair in (frame, self.clear)]
-        measured = pipeline.reduce_frames(registration.register_frames(*pairs), pipeline.Optics())
-        calibration = Calibration.of(measured)
-        margin = (self.bench.side - self.bench.pixels) // 2
-        return calibration, np.rint(calibration.places[0, :, 0, 0]).astype(int) - margin
-
-    def errors(self, phase, corner=(0, 0)):
-        """Phases less the truth, NaN where they are, on the grid of the truth."""
-        n, wide = self.truth.shape[-1], 8
-        whole = np.full((len(phase), n + 2 * wide, n + 2 * wide), np.nan)
-        row, column = wide + corner[0], wide + corner[1]
-        whole[:, row : row + phase.shape[1], column : column + phase.shape[2]] = phase
-        waves = np.exp(1j * (whole[:, wide:-wide, wide:-wide] - self.truth))
+    def errors(self, phase):
+        """Phases less the truth, NaN where they are."""
+        waves = np.exp(1j * (phase - self.truth))
         return np.angle(waves / np.nanmean(waves, axis=(1, 2), keepdims=True))
 
 
@@ -125,26 +107,10 @@ def estimate(recorded, calibration):
     return calibration(wide(np.where(recorded.bad, np.nan, recorded.unseen)))
 
 
-def test_quick_calibration_needs_no_flat_mirror(recorded):
-    aberrated = recorded.bench.counts(recorded.bench.smooth(1.0, 5), 6)
-    calibrations = [recorded.quick(), recorded.quick(aberrated)]
-    phases = [quick(recorded.unseen).phase for quick, _ in calibrations]
-    np.testing.assert_array_equal(*[corner for _, corner in calibrations])
-    change = phases[1] - phases[0]
-    assert rms(change, np.isfinite(change).all(axis=0)) < 0.03
-
-
-def test_phases_are_better_than_those_of_the_quick_calibration(recorded, estimate):
-    assert not estimate.flags.any()
-    quick, corner = recorded.quick()
-    before = recorded.errors(quick(recorded.unseen).phase, corner)
-    after, lit = recorded.errors(estimate.phase), recorded.bench.fully_lit
-    assert rms(after, lit) < 0.5 * rms(before, lit)
-    assert rms(after, lit) < 0.03
-
-
-def test_error_bars_hold_for_points_and_modes(recorded, calibration, estimate):
+def test_phases_are_right_and_their_error_bars_hold_for_points_and_modes(recorded, calibration, estimate):
     errors, lit = recorded.errors(estimate.phase), recorded.bench.fully_lit
+    assert not estimate.flags.any()
+    assert rms(errors, lit) < 0.03
     photons, noise = calibration.unit.mean(), recorded.bench.noise
     inner = ndimage.binary_erosion(lit, iterations=2)
     assert 0.8 < rms(errors / calibration.sigma(estimate, photons, noise), inner) < 1.3

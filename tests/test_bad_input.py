@@ -570,7 +570,7 @@ UNTEACHABLE = {
 ONES, WHOLE, WIDE = np.ones((4, 4)), np.ones((4, 4), int), zwfs.Pupil.from_amplitude(np.ones((9, 9)))
 POINTS, FOUR = np.ones(zwfs.Pupil.circular(4).n_points), zwfs.Pupil.circular(4)
 GLASS, CLEAR = zwfs.Patch(1, lambda u, v: np.exp(1j * u)), zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1, 0))
-MOVED = SENSOR.measure(0.01 * MODES)
+MOVED, MOST = SENSOR.measure(0.01 * MODES), PUPIL.scatter(np.arange(PUPIL.n_points) > 0, fill=False)
 BAND = zwfs.PolychromaticSensor(SENSOR, [600.0, 700.0])
 TWICE = zwfs.ZernikeSensor(PUPIL, *(zwfs.Dimple(1.06, phase) for phase in (1.5, 1.5, -1.5)))
 REFUSED |= {
@@ -669,6 +669,10 @@ REFUSED |= {
         zwfs.ZernikeSensor(PUPIL, GLASS), [0.9, 1.1], chromatic=True
     ),
     "expected a ZernikeSensor for PhaseShifted": lambda: zwfs.PhaseShifted(BAND),
+    "recorded is False at 1 points of the pupil": lambda: zwfs.ZernikeSensor(PUPIL, GLASS, recorded=MOST),
+    "unmeasured = 'zero': expected 'model'": lambda: zwfs.GerchbergSaxton(
+        zwfs.ZernikeSensor(PUPIL, GLASS, recorded=PUPIL.inside)
+    ),
     # a detector, metrics and units
     "photons = 0": lambda: zwfs.Detector(0),
     "read_noise = -1": lambda: zwfs.Detector(1, read_noise=-1),

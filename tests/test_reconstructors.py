@@ -232,19 +232,6 @@ def test_a_result_belongs_to_the_caller(make, method, screens):
         np.testing.assert_array_equal(getattr(again, name), expected[name])
 
 
-@pytest.mark.parametrize("n_masks", [1, 2])
-@pytest.mark.parametrize("poke", [0.1, 0.05, 1e-3])
-def test_interaction_matrix_is_the_derivative_of_the_frames(pupil, modes, screens, n_masks, poke):
-    sensor = ZernikeSensor(pupil, *[Dimple(1.06, phase) for phase in (np.pi / 2, -2.0)[:n_masks]], extent=1.3)
-    reference = screens(0.4, 1)[0]
-    field = np.exp(1j * reference)
-    slope = 2 * np.real(np.conj(sensor.propagate(field)) * sensor.propagate(1j * field * modes))
-    exact = pupil.gather(slope[(..., *sensor.window)]).reshape(len(modes), -1).T
-    matrix = Linear(sensor, modes, poke=poke, reference=reference).interaction_matrix
-    # The third derivative of a frame with respect to a mode is of order 1, where the mode is.
-    assert np.abs(matrix - exact).max() < 3 * poke**2 * np.abs(modes).max() ** 3
-
-
 def test_linear_is_exact_to_second_order_around_its_reference(pupil, modes, shifted, screens):
     reference = screens(0.5, 1)[0]
     reconstruct = Linear(shifted, modes, reference=reference, conditioning=1e-6, poke=1e-4)
@@ -654,15 +641,6 @@ def test_one_mask_needs_no_axis_of_masks(pupil, modes):
     np.testing.assert_array_equal(Arcsine(sensor)(frame[0]).phase, Arcsine(sensor)(frame).phase)
     with pytest.raises(ValueError, match="frames has shape"):
         Arcsine(sensor)(frame[0][1:])
-
-
-def test_recorded_pixels_hold_the_pupil_and_suit_the_method(pupil):
-    mask, most = Dimple(1.06, np.pi / 2), pupil.inside.copy()
-    most[np.nonzero(pupil.inside)[0][0], np.nonzero(pupil.inside)[1][0]] = False
-    with pytest.raises(ValueError, match="recorded is False at 1 points of the pupil"):
-        ZernikeSensor(pupil, mask, recorded=most)
-    with pytest.raises(ValueError, match="unmeasured = 'zero'"):
-        GerchbergSaxton(ZernikeSensor(pupil, mask, recorded=pupil.inside))
 
 
 def test_linear_coefficients_are_those_of_its_phase():

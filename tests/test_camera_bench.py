@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from zwfs import Dimple, Pupil, ZernikeSensor
+from zwfs import Pupil
 from zwfs._unwrapping import unwrapped
 from zwfs.frames import Calibration
 from zwfs.frames import _fit as fitting
@@ -18,30 +18,14 @@ from zwfs.frames._learnt import of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
 from zwfs.frames._prediction import _slopes
-from zwfs.frames._solver import fine_phase
 from zwfs.frames._states import PAD, Recording
 from zwfs.frames.phases import Flag
 
 from .hcipy_bench import BORDER, CASES, HcipyBench
 
-FINE = 16
-
 
 def blocks(image, k):
     return image.reshape(len(image) // k, k, -1, k).mean(axis=(1, 3))
-
-
-def test_fine_phase_has_the_means_of_the_pixels():
-    means = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(24, 24)), 0.8)
-    np.testing.assert_allclose(blocks(fine_phase(means, FINE), FINE), means, rtol=0, atol=2e-3)
-
-
-def test_fine_phase_of_a_parabola_is_its_value_and_not_its_mean():
-    y, x = np.mgrid[:40, :40] - 19.5
-    fine_y, fine_x = (np.mgrid[:80, :80] + 0.5) / 2 - 20
-    fine = fine_phase(0.01 * (x**2 + x * y) + 0.01 / 12, 2)
-    inner = (slice(30, 50),) * 2
-    np.testing.assert_allclose(fine[inner], 0.01 * (fine_x**2 + fine_x * fine_y)[inner], rtol=0, atol=1e-5)
 
 
 def test_unwrapped_phase_has_no_jump():
@@ -51,42 +35,6 @@ def test_unwrapped_phase_has_no_jump():
     assert np.ptp(true[inside]) > 3 * np.pi
     residual = (unwrapped(np.angle(np.exp(1j * true)), inside) - true)[inside]
     assert np.ptp(residual) < 1e-9
-
-
-@pytest.fixture(scope="module")
-def partly_lit():
-    """Fine amplitude and phase of a disc that cuts pixels, and its image with a blur, (ny, nx)."""
-    n, k, blur = 24, 8, 0.5
-    y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
-    amplitude = (np.hypot(y, x) < 9.7).astype(float)
-    phase = 0.5 * np.sin(x / 3 + 0.4) * np.cos(y / 4)
-    pupil = Pupil.from_amplitude(amplitude, 20 * k)
-    frame = np.mean(pupil.amplitude[pupil.inside] ** 2) * ZernikeSensor(pupil, Dimple(1.1, 1.5)).measure(phase)[0]
-    return amplitude, phase, blocks(ndimage.gaussian_filter(frame, blur * k, truncate=6), k), blur
-
-
-def modelled(partly_lit, f, areas):
-    amplitude, phase, _, blur = partly_lit
-    k = 8 // f
-    light, mean = blocks(amplitude**2, k), blocks(amplitude, k)
-    mean = mean if areas else np.sqrt(light)
-    camera = Camera(24, (24, 24), 20, [Exposure(0, 0, 0)], np.zeros((1, 24 * f, 24 * f)), f, 1.5)
-    values = np.array([0, 0, 0, 0, 1, 1, 0, 1.1, 1.5, -1.5, 0, 0, blur])
-    (image,) = Linearised(camera, Maps(mean, light - mean**2, blocks(phase, k)), values).images
-    return image
-
-
-def test_two_areas_describe_a_pixel_that_is_lit_in_part(partly_lit):
-    """With one amplitude, the root of the mean light, the error is several times larger."""
-    middle = (slice(2, -2),) * 2  # the light of the reference wave beyond the frame is not simulated
-    errors = {
-        (f, areas): np.abs(modelled(partly_lit, f, areas) - partly_lit[2])[middle].max()
-        for f in (1, 2)
-        for areas in (True, False)
-    }
-    assert errors[2, True] < 0.01
-    assert errors[2, True] < errors[2, False] / 3
-    assert errors[1, True] < errors[1, False] / 1.5
 
 
 def test_model_with_the_true_maps_makes_the_frames_of_a_foreign_bench():

@@ -82,7 +82,7 @@ def targets():
                     shown = not key.startswith("_") or key == "__call__"
                     if shown and key not in INTERNAL and callable(getattr(thing, key)):
                         public[f"{name}.{key}"] = member
-    del public["Bench"]  # 26 parameters at 20 ms a value: see test_bench.py
+    del public["Bench"]  # 26 parameters at 20 ms a value: see REFUSED
     del public["LearnedReference.train"]  # seconds a value: see test_learned.py
     del public["design_sensor"]  # the same: see test_design.py
     return public | RESULTS
@@ -454,6 +454,27 @@ def test_a_bad_value_is_named(name, parameter):
     assert not wrong, "\n".join(f"{name}({parameter}={label}): {fault}" for label, fault in wrong.items())
 
 
+RANDOM = {name for name, parameter in CASES if parameter == "seed"} - {"MaximumLikelihood", "write_bench"}
+
+
+@pytest.mark.parametrize("name", sorted(RANDOM))
+def test_a_seed_alone_decides_what_is_drawn(name):
+    def drawn(seed):
+        return [array for _, array in leaves(Call(name)(seed=seed)) if is_number(array)]
+
+    state, first, rng = np.random.get_state()[1].copy(), drawn(5), np.random.default_rng(5)
+    for seed, same in (
+        (5, True),
+        (np.random.SeedSequence(5), True),
+        (rng, True),
+        (rng, False),
+        (6, False),
+        (None, False),
+    ):
+        assert all(map(np.array_equal, drawn(seed), first)) == same
+    np.testing.assert_array_equal(np.random.get_state()[1], state)
+
+
 PUPIL = zwfs.Pupil.circular(8)
 SENSOR = zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1.06, 1.5), zwfs.Dimple(1.06, -1.5))
 SAME = np.stack([zwfs.zernike_basis(PUPIL, 4)[3]] * 6)
@@ -563,6 +584,11 @@ def controlled(**settings):
 
 
 FLAT, MODES = np.zeros((8, 8)), zwfs.zernike_basis(PUPIL, 4)
+IMPOSSIBLE = {
+    "leakage": 0.6, "flux_imbalance": 1, "photons_per_image": 0, "read_noise": -1, "background": -1, "seed": -1,
+    "static": -0.1, "focus_difference": 1, "misregistration": -1, "dimple_error": -1, "illumination": 2,
+    "n_rings": -1, "gap": 0.5, "stop": 0, "missing": (38,), "diameter": -1, "extent": 0.5,
+}  # fmt: skip
 UNTEACHABLE = {
     "n_screens": 10, "photons": (0, 1), "read_noise": -1, "seed": -1, "progress": 5, "n_iterations": 0,
     "errors": (0, 1), "screens": np.ones((2, 3, 3)), "amplitude": np.ones(3), "tolerance": -1,
@@ -789,6 +815,7 @@ REFUSED |= {
     r"method = 'fast': expected one of \['linear'": lambda: controlled(method="fast"),
     "n_iterations = 0: expected at least 1": lambda: controlled(n_iterations=0),
     # the simulated bench
+    **{f"^{name} = .*: .*expected": lambda name=name: Bench(**{name: IMPOSSIBLE[name]}) for name in IMPOSSIBLE},
     "phase is NaN all over a segment": lambda: segment_pistons(np.full((4, 4), np.nan), WHOLE, np.array([1])),
     "pistons and commanded have shapes": lambda: segment_residual([0.0, 1], [0.0, 1, 2]),
     "rms = -1: expected a finite": lambda: segment_screens(BENCH, -1, 2),

@@ -88,15 +88,6 @@ def test_fewer_screens_are_the_first_of_more(modes):
     np.testing.assert_allclose(few, many[:2], rtol=0, atol=1e-12)
 
 
-def test_screens_depend_on_the_seed_only(modes):
-    state = np.random.get_state()[1].copy()
-    first = power_law_screens(modes, 1, 2, seed=3)
-    for seed in (np.random.default_rng(3), np.random.SeedSequence(3)):
-        np.testing.assert_array_equal(first, power_law_screens(modes, 1, 2, seed=seed))
-    assert not np.allclose(first, power_law_screens(modes, 1, 2, seed=4))
-    np.testing.assert_array_equal(state, np.random.get_state()[1])
-
-
 @pytest.mark.parametrize("exponent", [-2.0, -11 / 3])
 def test_variance_of_the_coefficients_follows_the_power_law(exponent):
     pupil = Pupil.circular(40)

@@ -14,12 +14,7 @@ from zwfs.frames import Calibration
 from zwfs.frames import files as camera
 from zwfs.frames.pipeline import Optics, phase_of, recover_phase, reduce_frames
 from zwfs.frames.refine import fit, steps
-from zwfs.frames.registration import (
-    Image,
-    find_pupils,
-    register,
-    register_frames,
-)
+from zwfs.frames.registration import Image, find_pupils, register, register_frames
 from zwfs.frames.verdict import judge, order_of_images
 
 SEAL = "ZWFS_SEAL_FRAMES"

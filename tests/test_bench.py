@@ -362,9 +362,6 @@ def test_segment_screens_are_averaged_power_law_screens(perfect):
     assert not segment_screens(perfect, 0, 1, seed=4).any()
 
 
-# Bad input
-
-
 def test_numbers_of_other_types_are_kept_as_plain_ones():
     small = {name: np.int8(value) if isinstance(value, int) else value for name, value in SMALL.items()}
     converted = Bench(**small, seed=np.uint8(1), focus_difference=Fraction(1, 10**4))

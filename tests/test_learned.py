@@ -34,11 +34,6 @@ def row(**changes):
 
 
 @pytest.fixture(scope="module")
-def pupil():
-    return zwfs.Pupil.circular(40)
-
-
-@pytest.fixture(scope="module")
 def sensor(pupil):
     return pair(pupil)
 
@@ -215,7 +210,7 @@ def test_one_image_of_a_negative_shift_and_a_dimple_that_absorbs(pupil):
         LearnedReference(sensor, method.training, n_iterations=2)
 
 
-def test_a_large_dimple_is_read_better_than_by_two_accelerated_solves(pupil, shuffled):
+def test_a_large_dimple_is_read_better_than_by_two_accelerated_solves(pupil):
     """But not to the noise: `explains` says so, and further iterations go on from there."""
     sensor, truth = pair(pupil, 2.0), screens_of(pupil, 0.5, 40, seed=7)
     frames, settings = sensor.measure(truth), {"n_screens": 5000, "rms": (0.0, 1.2), "seed": 1}
@@ -223,7 +218,6 @@ def test_a_large_dimple_is_read_better_than_by_two_accelerated_solves(pupil, shu
     error = median_error(method, pupil, truth, frames)
     two = zwfs.PhaseShifted(sensor, n_iterations=2, tolerance=0, accelerate=True)
     assert error < 0.7 * median_error(two, pupil, truth, frames)
-    assert median_error(shuffled(sensor, **settings), pupil, truth, frames) > 3 * error
     assert not method(frames).explains(photons=1e4).any()
     further = LearnedReference(sensor, method.training, n_iterations=26)
     assert median_error(further, pupil, truth, frames) < 1e-3

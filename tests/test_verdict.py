@@ -125,6 +125,3 @@ def test_photons_are_those_of_the_mean_of_the_clear_frames_and_their_noise_is_th
     frames, clear_frames, _ = recorded(even, clear_photons=3e3)
     measurement = reduce_frames(register_frames(frames, clear_frames, exposure=1e3), Optics())
     assert judge(recover_phase(measurement), CameraNoise(1.0)).inner == pytest.approx(1, abs=0.12)
-
-
-# Places

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from zwfs import Pupil
-from zwfs._unwrapping import unwrapped
 from zwfs.frames import Calibration
 from zwfs.frames import _fit as fitting
 from zwfs.frames._fit import fit_bench
@@ -26,15 +24,6 @@ from .hcipy_bench import BORDER, CASES, HcipyBench
 
 def blocks(image, k):
     return image.reshape(len(image) // k, k, -1, k).mean(axis=(1, 3))
-
-
-def test_unwrapped_phase_has_no_jump():
-    inside = Pupil.circular(40).inside
-    true = 60 * ndimage.gaussian_filter(np.random.default_rng(2).normal(size=(40, 40)), 5)
-    true[~inside] = 0
-    assert np.ptp(true[inside]) > 3 * np.pi
-    residual = (unwrapped(np.angle(np.exp(1j * true)), inside) - true)[inside]
-    assert np.ptp(residual) < 1e-9
 
 
 def test_model_with_the_true_maps_makes_the_frames_of_a_foreign_bench():

@@ -23,25 +23,19 @@ from .hcipy_bench import HcipyBench
 pytest.importorskip("hcipy")
 OPTICS = {"diameter": 1.08, "shifts": (1.52, -1.60), "leakage": 0.02, "blur": 0.5, "fluxes": (1.0, 0.95)}
 TURNED = {"rotations": (0.0, 1.0), "magnifications": (1.0, 1.01), "offsets": ((0.3, -0.1), (-0.2, 0.3))}
-MAPS = {"amplitude_error": 0.05, "static": 0.1}
 
 
 class Recorded:
     """Frames of a bench with bad pixels: of commands, without the mask, and of unseen screens."""
 
-    def __init__(self, n_unseen, n_commands, rms, **bench):
-        self.bench = HcipyBench(**OPTICS, **TURNED, **MAPS, **bench)
-        frames, clear, self.phases = self.bench.recording(n_commands)
+    def __init__(self):
+        self.bench = HcipyBench(pixels=24, side=32, amplitude_error=0.05, static=0.1, **OPTICS, **TURNED)
+        frames, clear, self.phases = self.bench.recording()
         self.bad = np.random.default_rng(5).random(clear.shape) < 0.002
         self.frames, self.clear = (np.where(self.bad, np.nan, images) for images in (frames, clear))
-        screens = [self.bench.smooth(rms, 1000 + index) for index in range(n_unseen)]
+        screens = [self.bench.smooth(0.4, 1000 + index) for index in range(12)]
         self.unseen = np.stack([self.bench.counts(screen, (7, index)) for index, screen in enumerate(screens)])
         self.truth = np.stack([self.bench.on_pupil(screen + self.bench.flat) for screen in screens])
-
-    def calibration(self, **settings):
-        bench = self.bench
-        settings |= {"n_pixels": bench.pixels, "noise": bench.noise}
-        return Calibration.fit(self.frames, self.clear, self.phases, **settings)
 
     def errors(self, phase):
         """Phases less the truth, NaN where they are."""
@@ -56,7 +50,7 @@ def rms(errors, where):
 
 @pytest.fixture(scope="module")
 def recorded():
-    return Recorded(12, 4, 0.4, pixels=24, side=32)
+    return Recorded()
 
 
 def wide(pairs):

@@ -576,7 +576,8 @@ def registered(**settings):
 
 
 def linear():
-    return zwfs.Linear(sensor := camera()[-1].sensor, zwfs.zernike_basis(sensor.pupil, 3))
+    sensor = camera()[-1].sensor
+    return zwfs.Linear(sensor, zwfs.zernike_basis(sensor.pupil, 3))
 
 
 def controlled(**settings):

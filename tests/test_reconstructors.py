@@ -1,6 +1,7 @@
 import inspect
 import pickle
 import pkgutil
+import tracemalloc
 import warnings
 from importlib import import_module
 
@@ -305,6 +306,21 @@ def test_descent_never_climbs(pupil, shifted, screens):
     cost = [descent.cost(pupil.gather(phase), frames[np.newaxis])[0] for phase in path]
     assert np.all(np.diff(cost) < 0)
     assert cost[-1] < 1e-4 * cost[0]
+
+
+def test_memory_of_a_call_does_not_grow_with_the_batch():
+    sensor = ZernikeSensor(zwfs.Pupil.circular(100), Dimple(1.06, 1.5), Dimple(1.06, -1.5))
+    method, tilt = PhaseShifted(sensor, n_iterations=5, tolerance=0), np.tile(2 * sensor.pupil.x, (100, 1))
+
+    def beyond_its_result(n):
+        frames = np.repeat(sensor.measure(tilt)[np.newaxis].astype(np.float32), n, axis=0)
+        tracemalloc.start()
+        result = method(frames)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return peak - result.phase.nbytes - result.frames.nbytes
+
+    assert beyond_its_result(200) < 1.2 * beyond_its_result(10) + 100_000
 
 
 # What all have in common.

@@ -26,18 +26,6 @@ MASKS = {
 }
 
 
-@pytest.mark.parametrize("extent", [1, 2])
-@pytest.mark.parametrize("diameter", [0.5, 1.06, 2.2, 5])
-def test_dimple_has_the_airy_kernel(complex_field, rough_pupil, diameter, extent):
-    dimple = Dimple(diameter, 0.7, 0.8)
-    for pupil in (Pupil.circular(64), rough_pupil):
-        sensor = ZernikeSensor(pupil, dimple, extent=extent, tolerance=1e-14)
-        margin = sensor.window[0].start
-        for field in (pupil.amplitude, complex_field(pupil)):
-            exact = exact_reference(pupil, dimple, field, margin=margin)
-            np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("masks", MASKS.values(), ids=MASKS)
 def test_error_stays_at_the_tolerance(masks):
     pupil = Pupil.circular(12)

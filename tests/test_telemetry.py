@@ -681,8 +681,10 @@ BAD = {
     "pairs": (lambda path, f: _save(path, np.stack([f, f], 1)), r"its shape is \(12, 2, .*: expected \(n, 56"),
     "no frame": (lambda path, f: _save(path, f[:0]), r"its shape is \(0, 56, 112\)"),
     "other numbers": (lambda path, f: _save(path, f.astype(float)), "its numbers are float64: expected uint16"),
-    "truncated NPY": (lambda path, f: _cut(path, f, "npy"), "a broken NPY file: .* greater than file size"),
-    "truncated FITS": (lambda path, f: _cut(path, f, "fits"), "truncated: it holds 77376 of the 150528 bytes"),
+    "truncated": (
+        lambda path, f: path.write_bytes(Path("cube.fits").read_bytes()[:80000]),
+        "truncated: it holds 77120 of the 150528 bytes",
+    ),
     "unit": (
         lambda path, f: fits.PrimaryHDU(f, fits.Header({"BUNIT": "electron"})).writeto(path),
         "BUNIT = 'electron': expected 'adu', that of the calibration",
@@ -693,15 +695,6 @@ BAD = {
 def _save(path, array):
     with path.open("wb") as file:
         np.save(file, array)
-
-
-def _cut(path, frames, kind):
-    if kind == "npy":
-        _save(path, frames)
-    else:
-        fits.PrimaryHDU(frames).writeto(path)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) - frames.nbytes // 2 + (100 if kind == "npy" else 0)])
 
 
 @pytest.mark.parametrize("kind", BAD)

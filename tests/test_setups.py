@@ -15,7 +15,7 @@ from book._tools.notebook import read
 from book._tools.project import Project
 from studies.kit.parameters import Fields, check_parameters
 from studies.kit.setups import BASES, SCREENS, Noise, make_pupil, make_screens, turbulent_rms
-from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+from zwfs import Dimple, Pupil, ZernikeSensor
 from zwfs.turbulence import structure_function, turbulent_screens
 
 FIGURE_3 = "fig03_dynamic_range"
@@ -88,18 +88,6 @@ def test_screens_of_a_strength_scatter_as_turbulence_around_their_root_mean_squa
     np.testing.assert_allclose(source(largest / 2, 2, 1), screens[:2] / 2, rtol=1e-12)
     assert source.d_over_r0_of(largest) == pytest.approx(8.0, rel=1e-3)
     assert source.inputs([0.1, 1.0, 40.0]) == [0.1, 1.0, largest]
-
-
-def test_hexagonal_modes_are_orthonormal_on_the_pupil_and_zernike_modes_on_a_circle():
-    pupil = make_pupil(48, "hexagonal", n_rings=1)
-    values = pupil.gather(make_screens(pupil, 30, -2.0, basis="hexagonal").modes)
-    np.testing.assert_allclose(values @ values.T / pupil.n_points, np.eye(30), atol=1e-10)
-    # Mode j is mode j of Zernike less earlier ones: it adds only polynomials of its order.
-    zernike = pupil.gather(zernike_basis(pupil, 30))
-    np.testing.assert_allclose(np.tril(zernike @ values.T), zernike @ values.T, atol=1e-8 * pupil.n_points)
-    circle = make_pupil(100)
-    plain, orthonormal = (make_screens(circle, 15, -2.0, basis=basis).modes for basis in ("zernike", "hexagonal"))
-    assert circle.rms(plain - orthonormal).max() < 0.05
 
 
 def test_a_file_gives_pupil_and_screens(tmp_path):

@@ -229,6 +229,16 @@ def test_no_public_object_can_be_changed(rough_pupil, again):
     np.testing.assert_array_equal(after[1], before[1])
 
 
+@pytest.mark.parametrize("extent", [1, 1.5])
+def test_detector_sees_incoming_field_plus_reference_wave(pupil, complex_field, extent):
+    sensor = ZernikeSensor(pupil, *MASKS["two dimples"], extent=extent)
+    field = complex_field(pupil)
+    rest = sensor.propagate(field) - sensor.reference_wave(field)
+    np.testing.assert_allclose(rest[(..., *sensor.window)], [field * pupil.inside] * 2, atol=1e-14)
+    rest[(..., *sensor.window)] = 0
+    assert not rest.any()
+
+
 @pytest.mark.parametrize("phases", [(np.pi / 2, -np.pi / 2), (np.pi / 2, np.pi), (0.3, -2.0)])
 def test_reference_phases_differ_by_half_the_phases_of_the_dimples(pupil, screens, phases):
     sensor = ZernikeSensor(pupil, *(Dimple(1.06, phase) for phase in phases))

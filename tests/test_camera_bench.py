@@ -15,7 +15,6 @@ from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
-from zwfs.frames._prediction import _slopes
 from zwfs.frames._states import PAD, Recording
 from zwfs.frames.phases import Flag
 
@@ -278,18 +277,6 @@ def test_predicted_frames_move_with_the_images():
     np.testing.assert_allclose(estimate.displacement, (1, -0.5), rtol=0, atol=0.05)
     assert bench.error(estimate, screen) < 0.015
     assert not estimate.flags
-
-
-def test_jumps_and_wraps_make_no_slope():
-    phase = np.tile(np.arange(12.0)[:, np.newaxis], 2)
-    phase[6:] += 2.5
-    pairs = np.ones((11, 2), bool)
-    slopes = _slopes(np.angle(np.exp(0.3j * phase)), pairs)
-    np.testing.assert_allclose(np.delete(slopes, (5, 6), axis=0), 0.3, atol=1e-6)
-    assert np.all(np.abs(slopes) < 0.61)
-    edge = _slopes(phase, pairs & (np.arange(11) != 3)[:, np.newaxis])
-    np.testing.assert_allclose(edge[3:5], 1)  # of the only side
-    assert not _slopes(phase, ~pairs).any()
 
 
 def segments(bench, rms, width=6):

@@ -15,7 +15,6 @@ from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
-from zwfs.frames._states import PAD, Recording
 from zwfs.frames.phases import Flag
 
 from .hcipy_bench import BORDER, CASES, HcipyBench
@@ -98,21 +97,6 @@ def test_dark_spots_of_the_illumination_are_not_edges(mottling):
     full = Light.of(light, light, 1).full
     assert full[np.hypot(y, x) < 14].mean() > 0.95
     assert not full[np.hypot(y, x) > 17].any()
-
-
-def test_known_phases_go_on_beyond_an_outline_that_cuts_pixels():
-    """Pixels of the rim are means with zeros. One that touches the dark only by its corner has to be replaced."""
-    k, n = 16, 30
-    y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
-    true = np.stack([0.002 * (x**2 - 2 * x * y), 0.05 * x + 0.003 * y**2])
-    lit = np.hypot(y, x) < 14.3
-    phases = np.stack([blocks(phase * lit, k) for phase in true])
-    frames = np.ones((2, 2, n, n))
-    extended = Recording.of(frames, frames[0], phases, 28.6, 1.0, 1.0).phases[:, PAD:-PAD, PAD:-PAD]
-    touched = blocks(lit.astype(float), k) > 0
-    np.testing.assert_allclose(
-        extended[:, touched], np.stack([blocks(phase, k) for phase in true])[:, touched], atol=1e-6
-    )
 
 
 BENCH = replace(CASES["disc"], pixels=40, side=52)

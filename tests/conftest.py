@@ -122,6 +122,11 @@ def alive(pid):
         return False
 
 
+def pair(pupil, diameter=1.06, shifts=(np.pi / 2, -np.pi / 2), **options):
+    """Sensor with a dimple for each phase shift."""
+    return zwfs.ZernikeSensor(pupil, *(zwfs.Dimple(diameter, shift) for shift in shifts), **options)
+
+
 @pytest.fixture(scope="session")
 def pupil():
     return zwfs.Pupil.circular(40)
@@ -149,7 +154,7 @@ def classic(pupil):
 
 @pytest.fixture(scope="session")
 def shifted(pupil):
-    return zwfs.ZernikeSensor(pupil, zwfs.Dimple(1.06, np.pi / 2), zwfs.Dimple(1.06, -np.pi / 2))
+    return pair(pupil)
 
 
 SMALL = {"n_pixels": 68, "gap": 0.02, "stop": 0.8}  # of a bench: half its camera, 11 pixels of margin

@@ -23,14 +23,13 @@ def exact_ellipse(pupil, width, height, turned, field):
     return -fftconvolve(kernel, np.where(pupil.inside, field, 0), mode="valid") / pupil.n_pixels**2
 
 
-def exact_reference(pupil, dimple, field, margin=0, shift=(0.0, 0.0)):
+def exact_reference(pupil, dimple, field, margin=0):
     """Reference wave by the exact kernel, on a detector `margin` pixels wider than the pupil on each side.
 
-    The kernel depends on the displacement only, which is why a convolution does it. With `shift` the kernel is
-    moved by so many D along (x, y).
+    The kernel depends on the displacement only, which is why a convolution does it.
     """
     y, x = (np.arange(-(n + margin - 1), n + margin) / pupil.n_pixels for n in pupil.shape)
-    kernel = airy(dimple.diameter, x + shift[0], y[:, np.newaxis] + shift[1])
+    kernel = airy(dimple.diameter, x, y[:, np.newaxis])
     change = dimple.amplitude * np.exp(1j * dimple.phase) - 1
     return change * fftconvolve(kernel, np.where(pupil.inside, field, 0), mode="valid") / pupil.n_pixels**2
 

@@ -28,14 +28,15 @@ from zwfs.bench import Bench, BenchModel, segment_residual, segment_screens, wri
 from zwfs.bench.model import segment_pistons
 from zwfs.frames import BenchFit, Calibration, pipeline, reconstruct, recover_phase
 from zwfs.frames.files import read_all
+from zwfs.frames.refine import steps
 from zwfs.frames.registration import register_frames
 from zwfs.loop import LoopRecord
 from zwfs.masks import focal_field
 from zwfs.reconstructors.base import Reconstructor
-from zwfs.reconstructors.learned import BenchValues
+from zwfs.reconstructors.learned import BenchErrors, BenchValues
 from zwfs.turbulence import FrozenFlow, turbulent_screens
 
-from .conftest import needs_modes
+from .conftest import needs_modes, pair
 
 # What simulates a sensor and reconstructs a phase. Most tests of camera frames are in other files.
 MODULES = (
@@ -81,7 +82,7 @@ def targets():
                     shown = not key.startswith("_") or key == "__call__"
                     if shown and key not in INTERNAL and callable(getattr(thing, key)):
                         public[f"{name}.{key}"] = member
-    del public["Bench"]  # 26 parameters at 20 ms a value: see test_bench.py
+    del public["Bench"]  # 26 parameters at 20 ms a value: see REFUSED
     del public["LearnedReference.train"]  # seconds a value: see test_learned.py
     del public["design_sensor"]  # the same: see test_design.py
     return public | RESULTS
@@ -122,20 +123,15 @@ def valid() -> dict:
     arguments = {
         "pupil": pupil, "modes": modes, "phase": phase, "opd": phase, "field": field, "estimate": phase,
         "truth": phase, "sensor": shifted, "masks": plus, "maps": phase, "values": pupil.gather(phase),
-        "image": np.abs(field) + 0.1, "segments": (pupil.inside * 1).astype(int), "center": (5.5, 5.5),
-        "n_pixels": 12, "n_modes": 4, "n_rings": 1, "missing": (2,), "spiders": ((0.3, 0.1),), "gap": 0.02,
-        "stop": 0.9, "threshold": 0.1, "rms": 0.2, "r0": 0.2, "separation": np.array([0.1, 0.5]), "n_screens": 1,
-        "exponent": -2.0, "seed": 1, "diameter": 1.06, "function": lambda u, v: 0.9 * np.exp(1j * (u + v) / 9),
-        "breaks": (0.5,), "u": np.linspace(0, 0.5, 4), "v": np.linspace(0, 0.5, 4), "j": 4, "photons": 1e5,
-        "electrons": np.abs(field), "frames": shifted.measure(phase), "start": 0.1 * phase,
-        "reference": 0.0 * phase, "change": phase, "reconstructor": method, "mirror": mirror, "plant": shifted,
-        "influence": modes, "commands": np.zeros(5), "disturbance": phase[np.newaxis],
-        "screens": phase[np.newaxis],
-        "wavelength": 635.0, "n_actuators": 9, "n_cycles": 1, "wavelengths": [600.0, 650.0],
-        "weights": [1.0, 2.0], "bandwidth": 0.1, "n_wavelengths": 2, "n_iterations": 3, "tolerance": 1e-3,
-        "time": 0.01, "speed": 1.0, "cutoff": 3.0,
-        "bench": BENCH, "folder": ".", "pistons": pistons, "commanded": pistons,
-        "numbers": BENCH.numbers,
+        "image": np.abs(field) + 0.1, "center": (5.5, 5.5), "n_pixels": 12, "n_modes": 4, "rms": 0.2, "r0": 0.2,
+        "separation": np.array([0.1, 0.5]), "n_screens": 1, "seed": 1, "diameter": 1.06,
+        "function": lambda u, v: 0.9 * np.exp(1j * (u + v) / 9), "u": np.linspace(0, 0.5, 4),
+        "v": np.linspace(0, 0.5, 4), "j": 4, "photons": 1e5, "electrons": np.abs(field),
+        "frames": shifted.measure(phase), "change": phase, "reconstructor": method, "mirror": mirror,
+        "plant": shifted, "influence": modes, "commands": np.zeros(5), "disturbance": phase[np.newaxis],
+        "screens": phase[np.newaxis], "wavelength": 635.0, "n_cycles": 1, "wavelengths": [600.0, 650.0],
+        "bandwidth": 0.1, "tolerance": 1e-3, "time": 0.01, "bench": BENCH, "folder": ".", "pistons": pistons,
+        "commanded": pistons, "numbers": BENCH.numbers,
         # of one callable
         "Pupil.amplitude": pupil.amplitude,
         "Pupil.segments": pupil.segments,
@@ -453,6 +449,27 @@ def test_a_bad_value_is_named(name, parameter):
     assert not wrong, "\n".join(f"{name}({parameter}={label}): {fault}" for label, fault in wrong.items())
 
 
+RANDOM = {name for name, parameter in CASES if parameter == "seed"} - {"MaximumLikelihood", "write_bench"}
+
+
+@pytest.mark.parametrize("name", sorted(RANDOM))
+def test_a_seed_alone_decides_what_is_drawn(name):
+    def drawn(seed):
+        return [array for _, array in leaves(Call(name)(seed=seed)) if is_number(array)]
+
+    state, first, rng = np.random.get_state()[1].copy(), drawn(5), np.random.default_rng(5)
+    for seed, same in (
+        (5, True),
+        (np.random.SeedSequence(5), True),
+        (rng, True),
+        (rng, False),
+        (6, False),
+        (None, False),
+    ):
+        assert all(map(np.array_equal, drawn(seed), first)) == same
+    np.testing.assert_array_equal(np.random.get_state()[1], state)
+
+
 PUPIL = zwfs.Pupil.circular(8)
 SENSOR = zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1.06, 1.5), zwfs.Dimple(1.06, -1.5))
 SAME = np.stack([zwfs.zernike_basis(PUPIL, 4)[3]] * 6)
@@ -465,6 +482,11 @@ def fitted(**changes):
 
 def from_files(**changes):
     return Calibration.from_files(["a.fits"], ["b.fits"], **changes)
+
+
+def reconstructed(**changes):
+    np.save("a.npy", np.ones((1, *camera()[-1].shape)))
+    reconstruct("a.npy", camera()[-1], "b.fits", **changes)
 
 
 def called(**changes):
@@ -486,6 +508,7 @@ REFUSED = {
     r"pupil_diameter = 65504: expected .* \[8, ": lambda: register_frames(*camera()[:2], pupil_diameter=65504),
     "progress = 5: expected a function": lambda: fitted(progress=5),
     "progress = 'a': expected a function": lambda: from_files(progress="a"),
+    "progress = 2: expected a function": lambda: reconstructed(progress=2),
     "commands = 5: expected a str or a Path": lambda: from_files(commands=5),
     "exposure with commands: expected": lambda: from_files(commands="c.npy", exposure=2.0),
     "phase_shifts = 5: expected": lambda: from_files(phase_shifts=5),
@@ -527,11 +550,49 @@ def looped(**changes):
     return zwfs.close_loop(SENSOR, reconstructor=zwfs.PhaseShifted(SENSOR), **arguments)
 
 
+def learnt(shifts=(np.pi / 2, -np.pi / 2), diameter=1.06, pupil=None, **options):
+    return zwfs.LearnedReference(pair(pupil or zwfs.Pupil.circular(12), diameter, shifts), **options)
+
+
+def taught(shifts=(np.pi / 2, -np.pi / 2), **settings):
+    return zwfs.LearnedReference.train(pair(PUPIL, shifts=shifts), **settings)
+
+
+def designed(**question):
+    return zwfs.design_sensor(**{"error_nm": 5, "input_nm": 20, "wavelength_m": 635e-9, "n_modes": 6} | question)
+
+
+def looked(frames, dark=None):
+    return pipeline.phase_of(frames, np.ones((2, 10, 10)), dark)
+
+
+def registered(**settings):
+    return register_frames(*camera()[:2], **settings)
+
+
+def linear():
+    sensor = camera()[-1].sensor
+    return zwfs.Linear(sensor, zwfs.zernike_basis(sensor.pupil, 3))
+
+
+def controlled(**settings):
+    return camera()[-1].controller(*[np.zeros(camera()[-1].shape)] * 3, **settings)
+
+
 FLAT, MODES = np.zeros((8, 8)), zwfs.zernike_basis(PUPIL, 4)
+IMPOSSIBLE = {
+    "leakage": 0.6, "flux_imbalance": 1, "photons_per_image": 0, "read_noise": -1, "background": -1, "seed": -1,
+    "static": -0.1, "focus_difference": 1, "misregistration": -1, "dimple_error": -1, "illumination": 2,
+    "n_rings": -1, "gap": 0.5, "stop": 0, "missing": (38,), "diameter": -1, "extent": 0.5,
+}  # fmt: skip
+UNTEACHABLE = {
+    "n_screens": 10, "photons": (0, 1), "read_noise": -1, "seed": -1, "progress": 5, "n_iterations": 0,
+    "errors": (0, 1), "screens": np.ones((2, 3, 3)), "amplitude": np.ones(3), "tolerance": -1,
+}  # fmt: skip
 ONES, WHOLE, WIDE = np.ones((4, 4)), np.ones((4, 4), int), zwfs.Pupil.from_amplitude(np.ones((9, 9)))
 POINTS, FOUR = np.ones(zwfs.Pupil.circular(4).n_points), zwfs.Pupil.circular(4)
 GLASS, CLEAR = zwfs.Patch(1, lambda u, v: np.exp(1j * u)), zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1, 0))
-MOVED = SENSOR.measure(0.01 * MODES)
+MOVED, MOST = SENSOR.measure(0.01 * MODES), PUPIL.scatter(np.arange(PUPIL.n_points) > 0, fill=False)
 BAND = zwfs.PolychromaticSensor(SENSOR, [600.0, 700.0])
 TWICE = zwfs.ZernikeSensor(PUPIL, *(zwfs.Dimple(1.06, phase) for phase in (1.5, 1.5, -1.5)))
 REFUSED |= {
@@ -630,6 +691,10 @@ REFUSED |= {
         zwfs.ZernikeSensor(PUPIL, GLASS), [0.9, 1.1], chromatic=True
     ),
     "expected a ZernikeSensor for PhaseShifted": lambda: zwfs.PhaseShifted(BAND),
+    "recorded is False at 1 points of the pupil": lambda: zwfs.ZernikeSensor(PUPIL, GLASS, recorded=MOST),
+    "unmeasured = 'zero': expected 'model'": lambda: zwfs.GerchbergSaxton(
+        zwfs.ZernikeSensor(PUPIL, GLASS, recorded=PUPIL.inside)
+    ),
     # a detector, metrics and units
     "photons = 0": lambda: zwfs.Detector(0),
     "read_noise = -1": lambda: zwfs.Detector(1, read_noise=-1),
@@ -681,7 +746,72 @@ REFUSED |= {
     "stroke = 0": lambda: looped(stroke=0.0),
     "disturbance is empty": lambda: looped(disturbance=[]),
     "disturbance.1. has shape": lambda: looped(disturbance=[FLAT, np.zeros((2, 8, 8))]),
+    # a learned reference wave
+    "of 1.06 lambda/D and 1.571 rad: expected .* the training": lambda: learnt((np.pi / 2,)),
+    "1.06 lambda/D and 2 rad, .* the training": lambda: learnt((2.0, -1.0)),
+    "and -1.5 rad: expected .* the training": lambda: learnt((1.0, 2.5, -1.5)),
+    "dimples of 1.4 lambda/D .*: expected 1.06": lambda: learnt(diameter=1.4),
+    "wave of a flat wavefront differs": lambda: learnt(pupil=zwfs.Pupil.circular(12, 0.5)),
+    r"bench.phase_shift has shape \(3,\)": lambda: learnt(bench=BenchValues(0, 1, 0, np.zeros(3), 0, 0)),
+    r"frames has shape \(12, 12\): expected \(2, 12, 12\)": lambda: learnt().look()(np.ones((12, 12))),
+    "frames has dtype complex128": lambda: learnt().look()(np.ones((2, 12, 12), complex)),
+    "out is .*: expected an array of float32": lambda: learnt().look()(np.ones((2, 12, 12)), np.empty((12, 12))),
+    "bench = None: expected known errors of the bench": lambda: learnt(training="bench").look(),
+    r"masks\[1\] = Dimple.*: expected dimples of one diameter": lambda: zwfs.LearnedReference(
+        zwfs.ZernikeSensor(PUPIL, zwfs.Dimple(1.06, 1.5), zwfs.Dimple(1.2, -1.5))
+    ),
+    r"leakage = \(0.1, 0.0\): expected a smallest and a largest": lambda: BenchErrors(leakage=(0.1, 0.0)),
+    "errors.flux_ratio = .* for one mask": lambda: taught((1.5,), errors=BenchErrors(flux_ratio=(0.9, 1.1))),
+    "errors.leakage = .* for 3": lambda: taught((1.0, 2.0, -1.0), errors=BenchErrors(leakage=(0.0, 0.1))),
+    r"screens\[1\] is constant": lambda: taught(screens=[MODES[0], FLAT]),
+    r"rms = \(1.0, 1.0\): expected": lambda: taught(rms=(1, 1)),
+    **{f"^{name}": lambda name=name: taught(**{name: UNTEACHABLE[name]}) for name in UNTEACHABLE},
+    # a designed sensor
+    r"wavelength_m = 635.0: expected a finite number in \[1e-10, 0.01\]": lambda: designed(wavelength_m=635.0),
+    r"error_nm = 100: expected .* 63.5\]": lambda: designed(error_nm=100),
+    r"input_nm = 700: expected .* 635\]": lambda: designed(input_nm=700),
+    r"diameters = \(2.0, 1.0\): expected the smaller one first": lambda: designed(diameters=(2.0, 1.0)),
+    "zero_point = 1.*: expected frame_rate_hz and diameter_m, too": lambda: designed(zero_point=1e10),
+    # camera frames
+    r"frames has shape \(3, 10, 10\): .* or \(2, ny, nx\)": lambda: looked(np.ones((3, 10, 10))),
+    r"dark has shape \(3, 3\): expected \(2, 10, 10\)": lambda: looked(np.ones((2, 10, 10)), np.ones((3, 3))),
+    r"expected \(row, column\) of each of two pupils": lambda: registered(pupil_centers=[[45, 45]]),
+    "pupil_centers without a pupil_diameter": lambda: registered(pupil_centers=[[45, 45], [45, 137]]),
+    "cut off at the top": lambda: registered(pupil_centers=[[10, 25], [25, 79]], pupil_diameter=40),
+    "pupil_diameter = 7.9: expected": lambda: registered(pupil_diameter=7.9),
+    "pupil_diameter = 400: expected": lambda: registered(pupil_diameter=400),
+    "exposure = 0: expected": lambda: registered(exposure=0),
+    "^diameter = 0: expected": lambda: pipeline.Optics(0),
+    r"phase_shifts = \(1.5, 7.78": lambda: pipeline.Optics(phase_shifts=(1.5, 1.5 + 2 * np.pi)),
+    r"phase_shifts = \(0.0, 1.0\)": lambda: pipeline.Optics(phase_shifts=(0.0, 1.0)),
+    "leakage = 0.5: expected": lambda: pipeline.Optics(leakage=0.5),
+    "masks holds a str: expected masks": lambda: pipeline.Optics(masks=("ring",)),
+    r"fitted = \['colour'\]: expected": lambda: steps(*camera()[:2], pipeline.Optics(), ["colour"]),
+    "fitted = .* each name once": lambda: steps(*camera()[:2], pipeline.Optics(), ["scale", "scale"]),
+    "fitted = 'scale': expected a list": lambda: steps(*camera()[:2], pipeline.Optics(), "scale"),
+    # frames of known commands
+    "phases holds 1 state": lambda: fitted(phases=np.zeros((1, 8, 8)), frames=np.ones((1, 2, 8, 8))),
+    "one for each state": lambda: fitted(phases=np.zeros((3, 8, 8))),
+    "even differences": lambda: fitted(phases=np.ones((2, 7, 7))),
+    "clear_frames has shape": lambda: fitted(clear_frames=np.ones((2, 6, 6))),
+    "clear_frames hold .* expected light": lambda: fitted(clear_frames=np.zeros((2, 8, 8))),
+    "noise = 0": lambda: fitted(noise=0.0),
+    r"noise = 1e\+200": lambda: fitted(noise=1e200),
+    r"gain = 1e\+200": lambda: fitted(gain=1e200),
+    "diameter = 1000000000": lambda: fitted(diameter=1e9),
+    "frames has 3 images": lambda: fitted(frames=np.ones((2, 3, 8, 8))),
+    # a call of a calibration
+    r"counts has shape \(3, 10, 10\): expected \(\.\.\., 52, 104\)": lambda: camera()[-1](np.zeros((3, 10, 10))),
+    "method has another sensor": lambda: called(method=zwfs.PhaseShifted(SENSOR)),
+    "method is a str: expected a Reconstructor": lambda: called(method="linear"),
+    "start with method = Linear": lambda: called(start=np.zeros(camera()[-1].good.shape), method=linear()),
+    "poke = 0: expected": lambda: controlled(poke=0),
+    "gain = 3: expected": lambda: controlled(gain=3),
+    "rcond = 1: expected": lambda: controlled(rcond=1),
+    r"method = 'fast': expected one of \['linear'": lambda: controlled(method="fast"),
+    "n_iterations = 0: expected at least 1": lambda: controlled(n_iterations=0),
     # the simulated bench
+    **{f"^{name} = .*: .*expected": lambda name=name: Bench(**{name: IMPOSSIBLE[name]}) for name in IMPOSSIBLE},
     "phase is NaN all over a segment": lambda: segment_pistons(np.full((4, 4), np.nan), WHOLE, np.array([1])),
     "pistons and commanded have shapes": lambda: segment_residual([0.0, 1], [0.0, 1, 2]),
     "rms = -1: expected a finite": lambda: segment_screens(BENCH, -1, 2),
@@ -697,12 +827,6 @@ def test_bad_argument_is_refused_by_its_name_before_any_work(message):
 
 def test_modes_that_a_prior_tells_apart_need_not_be_independent():
     zwfs.MaximumLikelihood(SENSOR, SAME, photons=1e4, prior=np.eye(6))
-
-
-def test_progress_of_telemetry_is_refused_by_its_name(tmp_path):
-    np.save(tmp_path / "a.npy", np.ones((1, *camera()[-1].shape)))
-    with pytest.raises(TypeError, match="progress = 5: expected a function"):
-        reconstruct(tmp_path / "a.npy", camera()[-1], tmp_path / "b.fits", progress=5)
 
 
 def test_file_that_claims_a_larger_calibration_than_it_holds_is_refused_unread(tmp_path):

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 from scipy import ndimage
 
-from zwfs import Dimple, Pupil, ZernikeSensor
-from zwfs._unwrapping import unwrapped
 from zwfs.frames import Calibration
 from zwfs.frames import _fit as fitting
 from zwfs.frames._fit import fit_bench
@@ -17,76 +15,13 @@ from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames._learnt import of_bench
 from zwfs.frames._light import Light
 from zwfs.frames._optics import Camera, Exposure, Linearised, Maps
-from zwfs.frames._prediction import _slopes
-from zwfs.frames._solver import fine_phase
-from zwfs.frames._states import PAD, Recording
 from zwfs.frames.phases import Flag
 
-from .hcipy_bench import BEFORE, BORDER, CASES, RMS, HcipyBench
-
-FINE = 16
+from .hcipy_bench import BORDER, CASES, HcipyBench
 
 
 def blocks(image, k):
     return image.reshape(len(image) // k, k, -1, k).mean(axis=(1, 3))
-
-
-def test_fine_phase_has_the_means_of_the_pixels():
-    means = ndimage.gaussian_filter(np.random.default_rng(1).normal(size=(24, 24)), 0.8)
-    np.testing.assert_allclose(blocks(fine_phase(means, FINE), FINE), means, rtol=0, atol=2e-3)
-
-
-def test_fine_phase_of_a_parabola_is_its_value_and_not_its_mean():
-    y, x = np.mgrid[:40, :40] - 19.5
-    fine_y, fine_x = (np.mgrid[:80, :80] + 0.5) / 2 - 20
-    fine = fine_phase(0.01 * (x**2 + x * y) + 0.01 / 12, 2)
-    inner = (slice(30, 50),) * 2
-    np.testing.assert_allclose(fine[inner], 0.01 * (fine_x**2 + fine_x * fine_y)[inner], rtol=0, atol=1e-5)
-
-
-def test_unwrapped_phase_has_no_jump():
-    inside = Pupil.circular(40).inside
-    true = 60 * ndimage.gaussian_filter(np.random.default_rng(2).normal(size=(40, 40)), 5)
-    true[~inside] = 0
-    assert np.ptp(true[inside]) > 3 * np.pi
-    residual = (unwrapped(np.angle(np.exp(1j * true)), inside) - true)[inside]
-    assert np.ptp(residual) < 1e-9
-
-
-@pytest.fixture(scope="module")
-def partly_lit():
-    """Fine amplitude and phase of a disc that cuts pixels, and its image with a blur, (ny, nx)."""
-    n, k, blur = 24, 8, 0.5
-    y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
-    amplitude = (np.hypot(y, x) < 9.7).astype(float)
-    phase = 0.5 * np.sin(x / 3 + 0.4) * np.cos(y / 4)
-    pupil = Pupil.from_amplitude(amplitude, 20 * k)
-    frame = np.mean(pupil.amplitude[pupil.inside] ** 2) * ZernikeSensor(pupil, Dimple(1.1, 1.5)).measure(phase)[0]
-    return amplitude, phase, blocks(ndimage.gaussian_filter(frame, blur * k, truncate=6), k), blur
-
-
-def modelled(partly_lit, f, areas):
-    amplitude, phase, _, blur = partly_lit
-    k = 8 // f
-    light, mean = blocks(amplitude**2, k), blocks(amplitude, k)
-    mean = mean if areas else np.sqrt(light)
-    camera = Camera(24, (24, 24), 20, [Exposure(0, 0, 0)], np.zeros((1, 24 * f, 24 * f)), f, 1.5)
-    values = np.array([0, 0, 0, 0, 1, 1, 0, 1.1, 1.5, -1.5, 0, 0, blur])
-    (image,) = Linearised(camera, Maps(mean, light - mean**2, blocks(phase, k)), values).images
-    return image
-
-
-def test_two_areas_describe_a_pixel_that_is_lit_in_part(partly_lit):
-    """With one amplitude, the root of the mean light, the error is several times larger."""
-    middle = (slice(2, -2),) * 2  # the light of the reference wave beyond the frame is not simulated
-    errors = {
-        (f, areas): np.abs(modelled(partly_lit, f, areas) - partly_lit[2])[middle].max()
-        for f in (1, 2)
-        for areas in (True, False)
-    }
-    assert errors[2, True] < 0.01
-    assert errors[2, True] < errors[2, False] / 3
-    assert errors[1, True] < errors[1, False] / 1.5
 
 
 def test_model_with_the_true_maps_makes_the_frames_of_a_foreign_bench():
@@ -164,46 +99,6 @@ def test_dark_spots_of_the_illumination_are_not_edges(mottling):
     assert not full[np.hypot(y, x) > 17].any()
 
 
-def test_known_phases_go_on_beyond_an_outline_that_cuts_pixels():
-    """Pixels of the rim are means with zeros. One that touches the dark only by its corner has to be replaced."""
-    k, n = 16, 30
-    y, x = (np.mgrid[: n * k, : n * k] + 0.5) / k - n / 2
-    true = np.stack([0.002 * (x**2 - 2 * x * y), 0.05 * x + 0.003 * y**2])
-    lit = np.hypot(y, x) < 14.3
-    phases = np.stack([blocks(phase * lit, k) for phase in true])
-    frames = np.ones((2, 2, n, n))
-    extended = Recording.of(frames, frames[0], phases, 28.6, 1.0, 1.0).phases[:, PAD:-PAD, PAD:-PAD]
-    touched = blocks(lit.astype(float), k) > 0
-    np.testing.assert_allclose(
-        extended[:, touched], np.stack([blocks(phase, k) for phase in true])[:, touched], atol=1e-6
-    )
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"phases": np.zeros((1, 24, 24)), "frames": np.ones((1, 2, 24, 24))}, "phases holds 1 state"),
-        ({"phases": np.zeros((3, 24, 24))}, "one for each state"),
-        ({"phases": np.ones((2, 23, 23))}, "even differences"),
-        ({"clear_frames": np.ones((2, 20, 20))}, "clear_frames has shape"),
-        ({"clear_frames": np.zeros((2, 24, 24))}, "expected light"),
-        ({"noise": 0.0}, "noise = 0"),
-        ({"noise": 1e200}, r"noise = 1e\+200"),
-        ({"gain": 1e200}, r"gain = 1e\+200"),
-        ({"diameter": 1e9}, "diameter = 1"),
-        ({"frames": np.ones((2, 3, 24, 24))}, "frames has 3 images"),
-    ],
-)
-def test_data_that_do_not_belong_together_are_refused(change, message):
-    data = {
-        "frames": np.ones((2, 2, 24, 24)),
-        "clear_frames": np.ones((2, 24, 24)),
-        "phases": np.ones((2, 24, 24)),
-    }
-    with pytest.raises(ValueError, match=message):
-        fit_bench(**{**data, "n_pixels": 20, "noise": 1.0, **change})
-
-
 BENCH = replace(CASES["disc"], pixels=40, side=52)
 TURNED = replace(CASES["turned VLT"], pixels=40, side=52)
 
@@ -265,19 +160,19 @@ def test_fit_that_ends_early_has_not_converged():
     assert stages == [f"stage {number} of 4" for number in range(1, 5)]
 
 
-@pytest.mark.parametrize(("number", "rms"), list(enumerate(RMS)))
-def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated, number, rms):
+@pytest.mark.parametrize(("rms", "bound"), [(0.3, 0.0115), (0.8, 0.02), (1.2, 0.064)])
+def test_calibrated_phase_has_half_the_error_that_the_plain_route_had(calibrated, rms, bound):
     bench, calibration = calibrated
     screen = bench.smooth(rms, seed=1)
     counts = bench.counts(screen, (7, 1))
     estimate = calibration(counts, smooth=True)
-    asked = BEFORE["VLT" if bench is TURNED else "disc"]["plain"][number] / 2
-    assert bench.error(estimate, screen) < (min(0.02, asked) if rms <= 0.8 else asked)
+    assert bench.error(estimate, screen) < bound
     residual = (estimate - bench.on_pupil(screen + bench.flat))[bench.fully_lit]
     pull = (residual - residual.mean()) / estimate.sigma[bench.fully_lit]
     assert 0.5 < pull.std() < 2
 
 
+@pytest.mark.slow
 def test_smooth_phase_of_a_whole_camera_image_is_that_of_its_windows():
     bench, calibration = BENCH, fitted(BENCH)
     frames, _, phases = bench.recording(seed=1)
@@ -335,6 +230,19 @@ def test_call_without_a_prior_uses_all_of_the_fit(calibrated, rms, share):
     assert not calibration(counts).flags.any()
 
 
+def test_error_bars_of_a_call_without_a_prior_hold_away_from_edges(calibrated):
+    bench, calibration = calibrated
+    screens = [bench.smooth(0.5, seed=seed) for seed in range(31, 37)]
+    estimate = calibration(np.stack([bench.counts(screen, (9, 1)) for screen in screens]))
+    truth = np.stack([bench.on_pupil(screen + bench.flat) for screen in screens])
+    inner = ndimage.binary_erosion(bench.fully_lit)
+    waves = np.exp(1j * (estimate.phase - truth))[:, inner]
+    errors = np.angle(waves / waves.mean(axis=1, keepdims=True))
+    assert errors.std() < 0.012
+    sigma = calibration.sigma(estimate, calibration.unit.mean(), bench.noise)[:, inner]
+    assert 0.8 < (errors / sigma).std() < 1.3
+
+
 @pytest.mark.parametrize("change", [{"blur": 1.0}, {"leakage": 0.08}, {"offsets": ((0.8, -0.1), (0.45, 0.25))}])
 def test_frames_that_their_phases_do_not_predict_are_inconsistent(calibrated, change):
     """The phase of the ideal frames alone explains some of these, which are wrong by 0.04 rad and more."""
@@ -345,6 +253,7 @@ def test_frames_that_their_phases_do_not_predict_are_inconsistent(calibrated, ch
     assert estimate.flags & Flag.INCONSISTENT
 
 
+@pytest.mark.slow
 def test_predicted_frames_move_with_the_images():
     bench, calibration, screen = BENCH, fitted(BENCH), BENCH.smooth(0.5, seed=21)
     moved = replace(bench, offsets=tuple((row + 1, column - 0.5) for row, column in bench.offsets))
@@ -352,18 +261,6 @@ def test_predicted_frames_move_with_the_images():
     np.testing.assert_allclose(estimate.displacement, (1, -0.5), rtol=0, atol=0.05)
     assert bench.error(estimate, screen) < 0.015
     assert not estimate.flags
-
-
-def test_jumps_and_wraps_make_no_slope():
-    phase = np.tile(np.arange(12.0)[:, np.newaxis], 2)
-    phase[6:] += 2.5
-    pairs = np.ones((11, 2), bool)
-    slopes = _slopes(np.angle(np.exp(0.3j * phase)), pairs)
-    np.testing.assert_allclose(np.delete(slopes, (5, 6), axis=0), 0.3, atol=1e-6)
-    assert np.all(np.abs(slopes) < 0.61)
-    edge = _slopes(phase, pairs & (np.arange(11) != 3)[:, np.newaxis])
-    np.testing.assert_allclose(edge[3:5], 1)  # of the only side
-    assert not _slopes(phase, ~pairs).any()
 
 
 def segments(bench, rms, width=6):

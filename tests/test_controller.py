@@ -245,21 +245,6 @@ def test_pokes_that_make_no_sense_are_named(calibration, pokes):
             calibration.controller(*frames, poke=POKE)
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"poke": 0}, "poke = 0"),
-        ({"gain": 3}, "gain = 3"),
-        ({"rcond": 1}, "rcond = 1"),
-        ({"method": "fast"}, r"method = 'fast': expected one of \['linear'"),
-        ({"n_iterations": 0}, "n_iterations = 0"),
-    ],
-)
-def test_settings_are_refused_by_name(calibration, pokes, settings, message):
-    with pytest.raises(ValueError, match=message):
-        calibration.controller(*pokes, **settings)
-
-
 def test_frames_of_another_kind_are_refused_by_name(tmp_path, calibration, pokes, controller):
     with pytest.raises(ValueError, match=r"counts has shape \(3, 3\)"):
         controller(np.zeros((3, 3)))

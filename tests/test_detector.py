@@ -41,12 +41,3 @@ def test_normalise_undoes_expose(pupil):
     detector = Detector(1e12, background=1e11)
     np.testing.assert_allclose(detector.normalise(detector.expose(frames, 1)), frames, atol=2e-5)
     np.testing.assert_array_equal(Detector(1.0, background=2).normalise([0.0, 3]), [-2, 1])
-
-
-def test_seed_decides_the_noise(pupil, flat):
-    state = np.random.get_state()[1].copy()
-    detector = Detector(10, read_noise=1)
-    first = detector.expose(flat[:2], seed=3)
-    np.testing.assert_array_equal(first, detector.expose(flat[:2], seed=np.random.default_rng(3)))
-    assert np.any(first != detector.expose(flat[:2], seed=4))
-    np.testing.assert_array_equal(state, np.random.get_state()[1])

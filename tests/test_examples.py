@@ -9,7 +9,7 @@ import pytest
 from studies.kit.tables import with_zeros
 from zwfs.bench import Bench, write_bench
 
-from .conftest import ROOT
+from .conftest import ROOT, code_of
 
 
 def test_example_of_the_readme_runs(capsys):
@@ -20,18 +20,16 @@ def test_example_of_the_readme_runs(capsys):
     assert "False" not in printed
 
 
-def test_example_of_the_front_page_prints_what_it_says(capsys):
-    page = (ROOT / "book" / "index.md").read_text("utf-8")
-    (code,), (printed,) = (re.findall(rf"(?m)^```{kind}\n(.*?)^```", page, re.S) for kind in ("python", "text"))
-    exec(compile(code, "index.md", "exec"), {})
+@pytest.mark.parametrize("page", ["index.md", "own.md"])
+def test_example_of_a_page_prints_what_it_says(page, capsys):
+    (code,), (printed,) = code_of(page), code_of(page, "text")
+    exec(compile(code, page, "exec"), {})
     assert capsys.readouterr().out == printed
 
 
-def test_example_of_a_loop_prints_what_it_says(capsys):
+def test_fewer_loops_close_with_one_image(capsys):
     page = (ROOT / "book" / "own.md").read_text("utf-8")
-    (code,), (printed,) = (re.findall(rf"(?m)^```{kind}\n(.*?)^```", page, re.S) for kind in ("python", "text"))
-    exec(compile(code, "own.md", "exec"), {})
-    assert capsys.readouterr().out == printed
+    (code,) = code_of("own.md")
     exec(compile(code.replace("# One image: ", ""), "own.md", "exec"), {})
     (closed,) = re.findall(r"With one image \(comment in the code\), (\d+) of 24 loops close", page)
     assert capsys.readouterr().out.startswith(f"{closed} of 24 loops close")
@@ -39,7 +37,7 @@ def test_example_of_a_loop_prints_what_it_says(capsys):
 
 def test_table_of_delays_and_winds_is_that_of_the_example(capsys):
     page = (ROOT / "book" / "own.md").read_text("utf-8")
-    (code,) = re.findall(r"(?m)^```python\n(.*?)^```", page, re.S)
+    (code,) = code_of("own.md")
     rows = re.findall(r"(?m)^\| ([123]) steps? \| (.*?) \| (.*?) \| (.*?) \|$", page)
     assert len(rows) == 3
 
@@ -71,7 +69,7 @@ def test_example_of_a_verdict_needs_only_the_package(tmp_path, monkeypatch, caps
 def test_example_of_gradients_fits_the_phase(capsys):
     jax = pytest.importorskip("jax", reason="JAX is not installed")
     page = (ROOT / "book" / "your_reconstructor.md").read_text("utf-8")
-    (code,) = (block for block in re.findall(r"(?m)^```python\n(.*?)^```", page, re.S) if "import jax" in block)
+    (code,) = (block for block in code_of("your_reconstructor.md") if "import jax" in block)
     (stated,) = re.findall("(.) × 10⁻⁸ rad", page)
     before = jax.config.jax_enable_x64
     try:

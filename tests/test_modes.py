@@ -5,39 +5,12 @@ from scipy.special import eval_jacobi
 from zwfs import Pupil, noll_to_nm, power_law_screens, zernike_basis
 from zwfs.modes import fourier_basis, mode_frequencies
 
-POLYNOMIALS = {
-    2: lambda r, t: r * np.cos(t),
-    3: lambda r, t: r * np.sin(t),
-    4: lambda r, t: 2 * r**2 - 1,
-    5: lambda r, t: r**2 * np.sin(2 * t),
-    6: lambda r, t: r**2 * np.cos(2 * t),
-    7: lambda r, t: (3 * r**3 - 2 * r) * np.sin(t),
-    8: lambda r, t: (3 * r**3 - 2 * r) * np.cos(t),
-    9: lambda r, t: r**3 * np.sin(3 * t),
-    10: lambda r, t: r**3 * np.cos(3 * t),
-    11: lambda r, t: 6 * r**4 - 6 * r**2 + 1,
-    12: lambda r, t: (4 * r**4 - 3 * r**2) * np.cos(2 * t),
-    22: lambda r, t: 20 * r**6 - 30 * r**4 + 12 * r**2 - 1,
-}
-
-
-def polar(pupil):
-    x, y = pupil.points.T
-    return 2 * np.hypot(x, y), np.arctan2(y, x)
-
 
 def test_noll_numbering_reaches_every_mode_once():
     orders = [noll_to_nm(j) for j in range(1, 2017)]  # 63 full radial orders
     assert sorted(orders) == sorted((n, m) for n in range(63) for m in range(-n, n + 1, 2))
-    assert [n for n, _ in orders] == sorted(n for n, _ in orders)
+    assert [(n, abs(m)) for n, m in orders] == sorted((n, abs(m)) for n, m in orders)
     assert all(m == 0 or (m > 0) == (j % 2 == 0) for j, (_, m) in enumerate(orders, start=1))
-
-
-def test_modes_are_the_polynomials_of_noll():
-    pupil = Pupil.circular(128)
-    values = pupil.gather(zernike_basis(pupil, 22))
-    for j, polynomial in POLYNOMIALS.items():
-        assert np.corrcoef(values[j - 2], polynomial(*polar(pupil)))[0, 1] > 1 - 1e-9, j
 
 
 @pytest.mark.parametrize("pupil", [Pupil.circular(60), Pupil.circular(60, 0.3, [(1, 0.03)]), Pupil.hexagonal(60)])
@@ -65,8 +38,9 @@ def test_orthonormal_on_request_and_on_a_measured_pupil(pupil):
 def test_1500_modes_are_accurate():
     pupil = Pupil.circular(64)
     values = pupil.gather(zernike_basis(pupil, 1500))
-    radius, theta = polar(pupil)
-    for j in (2, 100, 777, 1377, 1431, 1490, 1501):
+    x, y = pupil.points.T
+    radius, theta = 2 * np.hypot(x, y), np.arctan2(y, x)
+    for j in (*range(2, 37), 100, 777, 1377, 1431, 1490, 1501):
         n, m = noll_to_nm(j)
         angular = np.cos(m * theta) if m >= 0 else np.sin(-m * theta)
         exact = radius ** abs(m) * eval_jacobi((n - abs(m)) // 2, 0, abs(m), 2 * radius**2 - 1) * angular
@@ -86,15 +60,6 @@ def test_every_screen_has_exactly_the_rms_asked_for(pupil, modes):
 def test_fewer_screens_are_the_first_of_more(modes):
     few, many = (power_law_screens(modes, 1, n, seed=3) for n in (2, 7))
     np.testing.assert_allclose(few, many[:2], rtol=0, atol=1e-12)
-
-
-def test_screens_depend_on_the_seed_only(modes):
-    state = np.random.get_state()[1].copy()
-    first = power_law_screens(modes, 1, 2, seed=3)
-    for seed in (np.random.default_rng(3), np.random.SeedSequence(3)):
-        np.testing.assert_array_equal(first, power_law_screens(modes, 1, 2, seed=seed))
-    assert not np.allclose(first, power_law_screens(modes, 1, 2, seed=4))
-    np.testing.assert_array_equal(state, np.random.get_state()[1])
 
 
 @pytest.mark.parametrize("exponent", [-2.0, -11 / 3])

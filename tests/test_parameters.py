@@ -9,8 +9,10 @@ from nbformat.v4 import new_code_cell, new_notebook
 
 from book._tools import declared
 from book._tools.notebook import read
+from studies.fig03_dynamic_range import LIMITS
 from studies.kit.parameters import check_parameters
 
+PUPIL = LIMITS["pupil"]  # nested
 NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 
 
@@ -51,6 +53,12 @@ def test_values_within_limits_pass(value, limits):
         (["a", 1], [str], TypeError, r"x\[1\] = 1: expected a string"),
         (1, (1,), TypeError, r"limits of x = \(1,\): expected"),
         (1, [(1, 2), (3, 4)], TypeError, "limits of x = "),
+        ({"obstruction": 1.2}, PUPIL, ValueError, "x.obstruction = 1.2"),
+        ({"obstuction": 0.2}, PUPIL, ValueError, "'x.obstuction' of kind 'circular': did you mean 'obstruction'"),
+        ({"kind": "keck", "missing": [1, 0]}, PUPIL, ValueError, r"x.missing\[1\] = 0"),
+        ({"kind": "kek"}, PUPIL, ValueError, "x.kind = 'kek'"),
+        ({"vanes": [[0.0, "a"]]}, PUPIL, TypeError, r"x.vanes\[0\]\[1\] = 'a'"),
+        ([], PUPIL, TypeError, r"x = \[\]"),
     ],
 )
 def test_values_beyond_limits_are_refused(value, limits, error, message):

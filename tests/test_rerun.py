@@ -365,6 +365,8 @@ def test_make_evaluates_no_argument(tmp_path, name, text):
 HOSTILE = {
     "script": "<script>document.title=666</script>",
     "link": "[x](javascript:document.title=666)",
+    "image": "![a](/etc/passwd) _b_ ~~d~~",
+    "bars": "a|b\\|c\\",
     "row": "a | b\n\n# A heading\n\n```{note}\n```\n",
     "code": "`` ` ` <b>bold</b> | $x$ {math}`y` *z* &lt;",
     "end": "</code></td></table></style><svg onload=document.title=666>",
@@ -386,8 +388,9 @@ def test_odd_names_are_shown_as_they_are(project, browser):
     page.wait_for_selector("math")
     assert [url for url in asked if not url.startswith("data:")] == [file.as_uri()]
     assert page.title() == "Title of fig02_works"
-    cells = page.locator(".cell_output td:first-child").all_inner_texts()
-    assert cells[-len(names) :] == [name.replace("\n", r"\n") for name in names]
+    for cells in ("th", "td:first-child"):
+        shown = page.locator(f".cell_output {cells}").all_inner_texts()
+        assert shown[-len(names) :] == [name.replace("\n", r"\n") for name in names]
     told = page.locator("main > section > table td:nth-child(2), blockquote ~ table td:nth-child(2)").first
     assert json.loads(told.inner_text()) == names
     page.close()

@@ -26,18 +26,6 @@ MASKS = {
 }
 
 
-@pytest.mark.parametrize("extent", [1, 2])
-@pytest.mark.parametrize("diameter", [0.5, 1.06, 2.2, 5])
-def test_dimple_has_the_airy_kernel(complex_field, rough_pupil, diameter, extent):
-    dimple = Dimple(diameter, 0.7, 0.8)
-    for pupil in (Pupil.circular(64), rough_pupil):
-        sensor = ZernikeSensor(pupil, dimple, extent=extent, tolerance=1e-14)
-        margin = sensor.window[0].start
-        for field in (pupil.amplitude, complex_field(pupil)):
-            exact = exact_reference(pupil, dimple, field, margin=margin)
-            np.testing.assert_allclose(sensor.reference_wave(field)[0], exact, rtol=0, atol=1e-12)
-
-
 @pytest.mark.parametrize("masks", MASKS.values(), ids=MASKS)
 def test_error_stays_at_the_tolerance(masks):
     pupil = Pupil.circular(12)
@@ -275,13 +263,6 @@ def test_amplitudes_in_a_batch(shifted, screens, pupil):
         for frames, turned, a in ((both, phase[i, j], i), (one_phase, phase[0, 0], i), (one_row, phase[i, j], 0)):
             expected = np.abs(shifted.propagate(amplitude[a, j] * np.exp(1j * turned))) ** 2
             np.testing.assert_allclose(frames[i, j], expected, atol=1e-12)
-
-
-def test_amplitude_is_that_of_the_pupil_unless_given(rough_pupil):
-    sensor = ZernikeSensor(rough_pupil, Dimple(1.06, np.pi / 2))
-    flat = np.zeros(rough_pupil.shape)
-    np.testing.assert_allclose(sensor.measure(flat), np.abs(sensor.propagate(rough_pupil.amplitude)) ** 2)
-    assert np.abs(sensor.measure(flat) - sensor.measure(flat, np.ones(flat.shape))).max() > 0.1
 
 
 def test_single_precision_in_single_precision_out(shifted, screens, pupil):

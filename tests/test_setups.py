@@ -15,7 +15,7 @@ from book._tools.notebook import read
 from book._tools.project import Project
 from studies.kit.parameters import Fields, check_parameters
 from studies.kit.setups import BASES, SCREENS, Noise, make_pupil, make_screens, turbulent_rms
-from zwfs import Dimple, Pupil, ZernikeSensor, zernike_basis
+from zwfs import Dimple, Pupil, ZernikeSensor
 from zwfs.turbulence import structure_function, turbulent_screens
 
 FIGURE_3 = "fig03_dynamic_range"
@@ -90,18 +90,6 @@ def test_screens_of_a_strength_scatter_as_turbulence_around_their_root_mean_squa
     assert source.inputs([0.1, 1.0, 40.0]) == [0.1, 1.0, largest]
 
 
-def test_hexagonal_modes_are_orthonormal_on_the_pupil_and_zernike_modes_on_a_circle():
-    pupil = make_pupil(48, "hexagonal", n_rings=1)
-    values = pupil.gather(make_screens(pupil, 30, -2.0, basis="hexagonal").modes)
-    np.testing.assert_allclose(values @ values.T / pupil.n_points, np.eye(30), atol=1e-10)
-    # Mode j is mode j of Zernike less earlier ones: it adds only polynomials of its order.
-    zernike = pupil.gather(zernike_basis(pupil, 30))
-    np.testing.assert_allclose(np.tril(zernike @ values.T), zernike @ values.T, atol=1e-8 * pupil.n_points)
-    circle = make_pupil(100)
-    plain, orthonormal = (make_screens(circle, 15, -2.0, basis=basis).modes for basis in ("zernike", "hexagonal"))
-    assert circle.rms(plain - orthonormal).max() < 0.05
-
-
 def test_a_file_gives_pupil_and_screens(tmp_path):
     image = np.clip(np.add.outer(np.arange(20.0), np.arange(20.0)), 3, None)
     np.save(tmp_path / "pupil.npy", image)
@@ -168,22 +156,6 @@ def test_noise_is_that_of_the_photons():
     assert np.mean(faint - sensor.measure(phase[0])) == pytest.approx(0, abs=0.01)  # negative pixels are kept
     with pytest.raises(ValueError, match=r"noise.read_noise = 1 with photons = 0"):
         Noise(read_noise=1.0)
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"obstruction": 1.2}, "pupil.obstruction = 1.2"),
-        ({"obstuction": 0.2}, "'pupil.obstuction' of kind 'circular': did you mean 'obstruction'"),
-        ({"kind": "keck", "missing": [1, 0]}, r"pupil.missing\[1\] = 0"),
-        ({"kind": "kek"}, "pupil.kind = 'kek'"),
-        ({"vanes": [[0.0, "a"]]}, r"pupil.vanes\[0\]\[1\] = 'a'"),
-        ([], r"pupil = \[\]"),
-    ],
-)
-def test_a_bad_nested_value_is_refused_with_its_path(values, message):
-    with pytest.raises((TypeError, ValueError), match=message):
-        check_parameters({"pupil": values}, pupil=STUDIES["fig03_dynamic_range"].LIMITS["pupil"])
 
 
 @pytest.mark.parametrize(

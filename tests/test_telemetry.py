@@ -1,6 +1,5 @@
 """A calibrated bench and its telemetry: phases, flags, what is refused, and that no frame is lost."""
 
-import gzip
 import json
 import os
 import pickle
@@ -129,6 +128,13 @@ def test_phase_is_that_of_the_plain_iteration_in_double_precision(bench, optics,
     assert not estimate.flags.any()
 
 
+def test_calibration_needs_no_flat_mirror(bench, calibration):
+    aberrated = register_frames([bench.image(bench.frames[0])], [bench.image(bench.clear)])
+    recalibrated = Calibration.of(reduce_frames(aberrated, Optics()), saturation=65535)
+    np.testing.assert_array_equal(recalibrated.places[0, :, 0, 0].round(), calibration.places[0, :, 0, 0].round())
+    assert rms(recalibrated(bench.frames).phase - calibration(bench.frames).phase) < 0.03
+
+
 def test_longer_exposure_time_of_the_frames_changes_no_phase(bench, calibration):
     def longer(counts):
         return 3.0 * counts - 2 * DARK
@@ -138,24 +144,6 @@ def test_longer_exposure_time_of_the_frames_changes_no_phase(bench, calibration)
     estimate, expected = recalibrated(longer(bench.frames[:2])), calibration(bench.frames[:2])
     np.testing.assert_allclose(estimate.phase, expected.phase, rtol=0, atol=1e-4)
     assert not estimate.flags.any()
-
-
-def test_phase_is_that_which_was_put_in(bench, calibration):
-    corner = calibration.places[0, :, 0, 0] - MARGIN
-    grid = np.rint(corner).astype(int)
-    window = slice(-grid[0], D - grid[0]), slice(-grid[1], D - grid[1])
-    for phase, screen in zip(calibration(bench.frames).phase, bench.screens, strict=True):
-        assert rms(phase[window] - screen) < 0.05
-
-
-def test_two_images_of_an_exposure_are_the_halves_of_one(bench, calibration):
-    half = bench.flat.shape[1] // 2
-    parts = [bench.image(image[:, side]) for image in (bench.flat, bench.clear)
-             for side in (slice(None, half), slice(half, None))]  # fmt: skip
-    two = Calibration.of(reduce_frames(register_frames(parts[:2], parts[2:]), Optics()))
-    frames = np.stack([bench.frames[..., :half], bench.frames[..., half:]], axis=1)
-    assert two.n_images == 2
-    assert rms(two(frames).phase - calibration(bench.frames).phase) < 0.01
 
 
 def test_calibration_is_kept_in_a_file_and_in_a_pickle(tmp_path, bench, calibration):
@@ -218,11 +206,6 @@ def test_calibration_replaces_no_other_file(folder, calibration):
     with pytest.raises(ValueError, match="exists and is not a calibration"):
         calibration.save("cube.fits")
     calibration.save("bench.npz")
-
-
-def test_counts_of_another_camera_are_refused(calibration):
-    with pytest.raises(ValueError, match=r"counts has shape \(3, 10, 10\): expected \(\.\.\., 56, 112\)"):
-        calibration(np.zeros((3, 10, 10)))
 
 
 # Other methods, other light
@@ -405,17 +388,6 @@ def test_method_keeps_the_flags_and_fills_bad_pixels(bench, calibration):
     assert rms(estimate.filled[1] - estimate.filled[0]) < 0.01
     same = PhaseShifted(calibration.sensor, accelerate=True, tolerance=1e-3)
     assert rms(calibration(images[:2], method=same).phase - calibration(images[:2]).phase) < 1e-3
-
-
-def test_method_of_another_sensor_is_refused(bench, calibration):
-    mismatched = replace(calibration, n_iterations=3)
-    with pytest.raises(ValueError, match="method has another sensor"):
-        calibration(bench.frames[0], method=linear(mismatched))
-    with pytest.raises(TypeError, match="method is a str: expected a Reconstructor"):
-        calibration(bench.frames[0], method="linear")
-    flat = np.zeros(calibration.good.shape)
-    with pytest.raises(ValueError, match="start with method = Linear"):
-        calibration(bench.frames[0], flat, method=linear(calibration))
 
 
 def test_sigma_without_errors_of_the_calibration_is_the_scatter_of_many_exposures(bench, calibration):
@@ -630,20 +602,9 @@ def test_memory_does_not_grow_with_the_cube(folder, monkeypatch, bench, calibrat
 # Kinds of files
 
 
-def scaled(path, frames):
-    """Half counts above 1000, and cards that say so: astropy would write the numbers without them."""
-    cards = {"BSCALE": 0.5, "BZERO": 1000.0, "BLANK": -(2**31)}
-    fits.PrimaryHDU((frames.astype(np.int32) - 1000) * 2).writeto(path)
-    with fits.open(path, mode="update", do_not_scale_image_data=True) as units:
-        units[0].header.update(cards)
-
-
 KINDS = {
     "cube.npy": np.save,
     "single.npy": lambda path, frames: np.save(path, frames[:, np.newaxis]),
-    "float.npy": lambda path, frames: np.save(path, frames.astype(">f8")),
-    "packed.fits": lambda path, _: path.write_bytes(gzip.compress(Path("cube.fits").read_bytes())),
-    "scaled.fits": scaled,
     "columns.npy": lambda path, frames: np.save(path, np.asfortranarray(frames)),
     "compressed.fits": lambda path, frames: fits.HDUList([fits.PrimaryHDU(), fits.CompImageHDU(frames)]).writeto(
         path
@@ -720,8 +681,10 @@ BAD = {
     "pairs": (lambda path, f: _save(path, np.stack([f, f], 1)), r"its shape is \(12, 2, .*: expected \(n, 56"),
     "no frame": (lambda path, f: _save(path, f[:0]), r"its shape is \(0, 56, 112\)"),
     "other numbers": (lambda path, f: _save(path, f.astype(float)), "its numbers are float64: expected uint16"),
-    "truncated NPY": (lambda path, f: _cut(path, f, "npy"), "a broken NPY file: .* greater than file size"),
-    "truncated FITS": (lambda path, f: _cut(path, f, "fits"), "truncated: it holds 77376 of the 150528 bytes"),
+    "truncated": (
+        lambda path, f: path.write_bytes(Path("cube.fits").read_bytes()[:80000]),
+        "truncated: it holds 77120 of the 150528 bytes",
+    ),
     "unit": (
         lambda path, f: fits.PrimaryHDU(f, fits.Header({"BUNIT": "electron"})).writeto(path),
         "BUNIT = 'electron': expected 'adu', that of the calibration",
@@ -732,15 +695,6 @@ BAD = {
 def _save(path, array):
     with path.open("wb") as file:
         np.save(file, array)
-
-
-def _cut(path, frames, kind):
-    if kind == "npy":
-        _save(path, frames)
-    else:
-        fits.PrimaryHDU(frames).writeto(path)
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) - frames.nbytes // 2 + (100 if kind == "npy" else 0)])
 
 
 @pytest.mark.parametrize("kind", BAD)

@@ -5,15 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from zwfs.frames.pipeline import (
-    Optics,
-    iterated_phase,
-    recover_phase,
-    reduce_frames,
-    upside_down,
-)
+from zwfs.frames.pipeline import Optics, iterated_phase, recover_phase, reduce_frames, upside_down
 from zwfs.frames.refine import fit, steps
-from zwfs.frames.registration import FRAMES, Image, Placement, RegisteredFrames, register_frames
+from zwfs.frames.registration import register_frames
 from zwfs.frames.verdict import CameraNoise, _of_score, judge
 
 from .hcipy_bench import HcipyBench
@@ -102,8 +96,6 @@ def test_rotation_that_is_not_determined_is_named_and_the_misfit_is_not_called_e
     assert not verdict.placed
     assert verdict.explained is None
     assert "do not determine the rotation" in verdict.findings["fit"]
-    assert "xplained" not in verdict.findings["fit"]
-    assert "its rotation is not determined" in verdict.findings["registration"]
 
 
 def test_scale_of_the_phase_is_determined_by_frames_that_belong_together_only(found):
@@ -113,7 +105,6 @@ def test_scale_of_the_phase_is_determined_by_frames_that_belong_together_only(fo
     control = upside_down(found.measurement)
     nonsense = judge(replace(found, phase=iterated_phase(control, 25, 1e-4), measurement=control))
     assert "The scale of the phase is not determined" in nonsense.findings["scale"]
-    assert f"{nonsense.strengths[0]:.2f} to {nonsense.strengths[1]:.2f} rad rms" in nonsense.findings["scale"]
     assert nonsense.strengths[1] > 1.5 * nonsense.strengths[0]
 
 
@@ -134,31 +125,3 @@ def test_photons_are_those_of_the_mean_of_the_clear_frames_and_their_noise_is_th
     frames, clear_frames, _ = recorded(even, clear_photons=3e3)
     measurement = reduce_frames(register_frames(frames, clear_frames, exposure=1e3), Optics())
     assert judge(recover_phase(measurement), CameraNoise(1.0)).inner == pytest.approx(1, abs=0.12)
-
-
-# Places
-
-
-def test_second_image_is_turned_about_the_centre_of_its_pupil():
-    """The offset between the images comes after the rotation."""
-    shape, shift = (60, 140), np.array([3.0, 70.0])
-    rows, columns = np.indices(shape)
-    images = [Image(one.astype(float), np.zeros(shape, bool)) for one in (rows, columns)]
-    placement = Placement(shift, rotation=5.0, magnification=1.02)
-    disc = RegisteredFrames(
-        (images[0], images[0]), (images[0], images[0]), (_circle(), _circle()),
-        np.array([[0.0, 0.0], shift, [0.0, 0.0], shift]), placement=placement,
-    )  # fmt: skip
-    for axis, image in enumerate(images):
-        seen = replace(disc, frames=(image, image))._on_grid(FRAMES)[0] / disc.areas[:2, None, None]
-        middle = (29.0, 30.0)[axis]
-        np.testing.assert_allclose(seen.mean(axis=(1, 2)), [middle, middle + shift[axis]], atol=1e-6)
-        # One column to the right on the first image, on both.
-        step = np.diff(seen, axis=2).mean(axis=(1, 2))
-        np.testing.assert_allclose(step, [axis, placement.matrix[axis, 1]], atol=1e-6)
-
-
-def _circle():
-    from zwfs.frames._outline import Circle
-
-    return Circle(29.0, 30.0, 31.0)

@@ -6,7 +6,6 @@ machine what the clock shows, on a busy one hardly more.
 
 import json
 import sys
-import tracemalloc
 from dataclasses import replace
 from functools import partial
 from itertools import cycle
@@ -35,7 +34,6 @@ from . import latency, telemetry
 from .convolution import ConvolutionalNetwork
 
 DIMPLES = (Dimple(1.06, np.pi / 2), Dimple(1.06, -np.pi / 2))
-REAL_TIME = {"n_iterations": 2, "tolerance": 0.0, "accelerate": True}
 
 
 def best(function, seconds):
@@ -111,26 +109,6 @@ def slope(seconds, sizes=(32, 64, 128, 256, 512, 1024)):
         frames = sensor.measure(np.zeros(sensor.pupil.shape)).astype(np.float32)
         calls[n_pixels] = _reading(method, frames, "residual")
     return {"n_pixels": list(sizes), "times": list(best_of_each(calls, seconds).values())}
-
-
-def batches(seconds, sizes=(1, 10, 100, 1000)):
-    """Time per frame pair of batches, and the memory that a call takes beyond its frames and results, bytes."""
-    pupil = Pupil.circular(100)
-    sensor = ZernikeSensor(pupil, *DIMPLES)
-    method = PhaseShifted(sensor, n_iterations=5, tolerance=0.0)
-    screen = screens_at(zernike_basis(pupil, 200), 0.8, 1, 2024, 7)
-    frame, rows = sensor.measure(screen).astype(np.float32), []
-    for n in sizes:
-        frames = np.repeat(frame, n, axis=0)
-        time = best(lambda: method(frames), seconds) / n  # noqa: B023
-        tracemalloc.start()
-        result = method(frames)
-        peak = tracemalloc.get_traced_memory()[1]
-        tracemalloc.stop()
-        rows.append(
-            {"n_frames": n, "time per frame": time, "memory": peak - result.phase.nbytes - result.frames.nbytes}
-        )
-    return rows
 
 
 def others(seconds):

@@ -90,7 +90,7 @@ def parts(calibration, frames):
     }  # fmt: skip
 
 
-def telemetry(n=10_000, n_workers=2, n_pixels=90, **settings):
+def telemetry(n=10_000, n_workers=2, n_pixels=90):
     """Times of a cube: by the clock, of the processor, of its parts for each frame pair; and memory, bytes."""
     calibration, frames, _ = camera(n_pixels, _DISTINCT)
     with tempfile.TemporaryDirectory() as folder:
@@ -98,7 +98,7 @@ def telemetry(n=10_000, n_workers=2, n_pixels=90, **settings):
         write_cube(cube, frames, n)
         calibration(frames[:1])
         before, clock, busy = _peak(), perf_counter(), process_time()
-        found = reconstruct(cube, calibration, output, n_workers=n_workers, **settings)
+        found = reconstruct(cube, calibration, output, n_workers=n_workers)
         clock, busy = perf_counter() - clock, process_time() - busy
         assert found.n_flagged == 0
         return {

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._system import path_of
+from zwfs.frames._grid import pixels_around
 from zwfs.frames._stack import Stack
 from zwfs.frames.phases import Flag
 
@@ -212,14 +213,9 @@ def faintest(noise: float, n_pixels: int) -> float:
 
 def _pixels(calibration: Calibration) -> NDArray[np.bool_]:
     """Good pixels of the camera next to a point of the pupil, in either image."""
-    mask = np.zeros((calibration.n_images, *calibration.shape), bool)
-    for index, places in enumerate(calibration.places):
-        low = np.floor(places[:, calibration.amplitude > 0]).astype(int)
-        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            row, column = (low.T + step).T
-            inside = (row >= 0) & (row < calibration.shape[0]) & (column >= 0) & (column < calibration.shape[1])
-            mask[min(index, calibration.n_images - 1), row[inside], column[inside]] = True
-    return (mask & ~calibration.bad).reshape(image_shape(calibration))
+    places = calibration.places[:, :, calibration.amplitude > 0]
+    around = pixels_around(places, calibration.n_images, calibration.shape)
+    return (around & ~calibration.bad).reshape(image_shape(calibration))
 
 
 def _frames_of(name: str, value: Any, calibration: Calibration) -> NDArray:

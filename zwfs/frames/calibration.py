@@ -14,7 +14,7 @@ import math
 import warnings
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of
-from zwfs.frames._exposures import Exposures
+from zwfs.frames._exposures import SURE, Exposures
 from zwfs.frames._fit import BenchFit, fit_bench
 from zwfs.frames._fitted import WIDEST, smooth_phases
 from zwfs.frames._follow import checked_follow, followed
@@ -89,6 +89,8 @@ class Calibration(Immutable):
         at neighbouring points.
     displacements : ndarray, shape (n_states, 2), pixels
         Rows and columns by which the rim of the pupil on the calibration's frames differs from the model.
+    around : ndarray, shape (2,)
+        Background of the calibration's frames, as that of `Phases`, to which that of other frames is compared.
     residual : float
         Rms difference of the calibration's frames and their model, the largest of all states, as in `Phases`.
     saturation : float, counts
@@ -126,6 +128,7 @@ class Calibration(Immutable):
     unexplained: NDArray[np.float32]
     slopes: NDArray[np.float64]
     displacements: NDArray[np.float64]
+    around: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     residual: float = 0.0
     light_ratio: float = 1.0
     saturation: float = np.inf
@@ -149,6 +152,7 @@ class Calibration(Immutable):
             "amplitude": grid, "good": grid, "bad": camera, "places": (2, 2, *grid),
             "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid), "offset": (2, *grid),
             "light": (2,), "unexplained": (n_states, *grid), "slopes": (n_states,), "displacements": (n_states, 2),
+            "around": (2,),
         }  # fmt: skip
         for name, size in sizes.items():
             array = getattr(self, name)
@@ -374,13 +378,16 @@ class Calibration(Immutable):
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
         phase = calibration._work.solve(frames, good[np.newaxis]).phase
         errors = sideways(calibration.sensor, phase[0], frames[0], good)[np.newaxis]
-        shift = calibration._work.displaced(phase, frames, good[np.newaxis])[0]
-        residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
+        work, steady = calibration._work, calibration._work.steady(phase)
+        shift = work.displaced(steady, frames, good[np.newaxis])[0]
+        residual, ratio = work.compared(phase, frames, good[np.newaxis])
+        counts = np.stack([image.counts for image in images])[np.newaxis] + dark
+        level, error = work.background(work.cleaned(counts, np.inf, good)[0], steady, calibration.unit)
         if remark := doubt(measurement, phase[0]):
             warnings.warn(remark, stacklevel=3)
         return replace(
             calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
-            residual=float(residual[0]), light_ratio=float(ratio[0]),
+            around=np.where(np.abs(level) > SURE * error, level, 0)[0, 0], residual=float(residual[0]), light_ratio=float(ratio[0]),
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:

@@ -121,7 +121,11 @@ class Exposures:
             self._explain(trial)
         residual, displacement, moved, background, stray = self._compared(trial)
         limits = self._unusual * trial.usual if limit is None else limit
-        flags = _BAD * (self.n_bad > 0) + _SATURATED * (self.n_saturated > 0) + INCONSISTENT * (stray | (residual > limits))
+        flags = (
+            _BAD * (self.n_bad > 0)
+            + _SATURATED * (self.n_saturated > 0)
+            + INCONSISTENT * (stray | (residual > limits))
+        )
         flags += np.where(self.lit, _NOT_CONVERGED * (~trial.converged & (self._of.tolerance > 0)), _LOST)
         return Phases(
             phase=np.where(self.good & self.lit[:, np.newaxis, np.newaxis], trial.phase, np.float32(np.nan)),

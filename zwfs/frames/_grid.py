@@ -155,8 +155,10 @@ class Grid:
             far = far & on_camera & dark[(image, *np.where(on_camera, pixels, 0))]
         chosen = np.flatnonzero(far)
         self.far = chosen[:: 1 + len(chosen) // _MOST] if len(chosen) >= _FEWEST else chosen[:0]
-        rows, columns = (nearest.reshape(2, 2, -1)[..., self.far] - low[..., np.newaxis]).transpose(1, 0, 2)
-        self.far_pixels = rows * size[1] + columns
+        rows, columns = nearest.reshape(2, 2, -1)[..., self.far].transpose(1, 0, 2)
+        self.far_pixels = (rows - low[:, :1]) * size[1] + columns - low[:, 1:]
+        images = np.reshape([box[0] for box in self.boxes], (2, 1))
+        self.far_on_camera = np.ravel_multi_index((images, rows, columns), calibration.bad.shape)
 
     def _ignore(self, good: NDArray[np.bool_]) -> None:
         """Set the good points, and bad ones of the pupil with their nearest good ones."""
@@ -273,7 +275,9 @@ class Grid:
         if not self.far.size:
             return np.full((2, len(raw), 2), np.nan), np.full((2, len(raw), 2), np.nan)
         values = np.stack([raw[:, i].reshape(len(raw), -1)[:, far] for i, far in enumerate(self.far_pixels)], 1)
-        return _constant(values / unit[..., np.newaxis].astype(np.float32), modelled.reshape(len(raw), 2, -1)[..., self.far])
+        return _constant(
+            values / unit[..., np.newaxis].astype(np.float32), modelled.reshape(len(raw), 2, -1)[..., self.far]
+        )
 
     def modelled(self, phase: NDArray) -> NDArray:
         """Frames of phases on the grid of the pupil, (k, 2, ny, nx)."""

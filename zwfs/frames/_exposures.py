@@ -55,6 +55,7 @@ class Trial(NamedTuple):
     usual: NDArray[np.float64]  # (k,), of frames like those of the calibration
     ratio: NDArray[np.float64]  # (k,), light of the frames over that of their model
     cost: NDArray[np.float64]  # (k,), of both: 1 for frames like those of the calibration
+    moved: NDArray[np.bool_]  # (k,), as the prediction of a bench shows it
 
     def improved(self, which: NDArray[np.intp], rival: Trial, factor: float = 1.0) -> NDArray[np.bool_]:
         """Take over those of some exposures that cost less than a part of what they cost here."""
@@ -158,15 +159,16 @@ class Exposures:
             if self._method:
                 solved = work.solve(corrected.quiet, good, start, self._method)
         usual, (residual, ratio) = self._usual(light, self.noise[which]), np.full((2, len(which)), np.nan)
+        moved = np.zeros(len(which), bool)
         if self._judge:
             residual, ratio = work.compared(solved.phase, frames, good)
         if self._judge and corrected and not self._method:  # counts are compared, not ideal frames
-            residual = corrected.residual
+            residual, moved = corrected.residual, corrected.moved
             usual = np.maximum(corrected.noise, max(self._of.residual, _EXACT_OF_BENCH))
         ratio = ratio / self._of.light_ratio
         unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(self.n_good[which]))
         cost = np.where(self.lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)
-        return Trial(light, solved.phase, frames, *solved[1:], residual, usual, ratio, cost)
+        return Trial(light, solved.phase, frames, *solved[1:], residual, usual, ratio, cost, moved)
 
     def _explain(self, best: Trial) -> None:
         """Improve the light of those exposures that their first light does not explain."""
@@ -206,7 +208,7 @@ class Exposures:
             stray[lit] = np.any(levels > np.maximum(_STRAY, SURE * errors), axis=(0, 2))
         scatter = usual.std(axis=0) if len(usual) else 0
         moved = np.abs(displacement) > np.maximum(MOVED_BY, SURE * np.hypot(sigma, scatter))
-        return residual, displacement, moved.any(axis=1), background, stray
+        return residual, displacement, trial.moved | moved.any(axis=1), background, stray
 
     def _dark_noise(self, counts: NDArray, flux: NDArray) -> NDArray[np.float64]:
         """Noise of dark pixels over `unit`, (k, 2), of exposures so faint that it counts; else 0."""

@@ -381,13 +381,14 @@ class Calibration(Immutable):
         work, steady = calibration._work, calibration._work.steady(phase)
         shift = work.displaced(steady, frames, good[np.newaxis])[0]
         residual, ratio = work.compared(phase, frames, good[np.newaxis])
-        counts = np.stack([image.counts for image in images])[np.newaxis] + dark
-        level, error = work.background(work.cleaned(counts, np.inf, good)[0], steady, calibration.unit)
+        exposure = np.stack([image.counts for image in images])[np.newaxis] + dark
+        level, error = work.background(work.cleaned(exposure, np.inf, good)[0], steady, calibration.unit)
+        around = np.where(np.abs(level) > SURE * error, level, 0)[0, 0]
         if remark := doubt(measurement, phase[0]):
             warnings.warn(remark, stacklevel=3)
         return replace(
             calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
-            around=np.where(np.abs(level) > SURE * error, level, 0)[0, 0], residual=float(residual[0]), light_ratio=float(ratio[0]),
+            around=around, residual=float(residual[0]), light_ratio=float(ratio[0]),
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:

@@ -30,12 +30,12 @@ from zwfs.frames._pokes import (
     Inverse,
     Pokes,
     Signals,
+    beyond_noise,
     faintest,
     image_shape,
     phases_of,
     roughness,
     surroundings,
-    beyond_noise,
 )
 from zwfs.reconstructors import MaximumLikelihood
 from zwfs.reconstructors._tracking import Tracking

@@ -35,7 +35,8 @@ class Flag(IntFlag):
         The iteration used all its steps.
     MOVED
         The images have moved on the camera since the calibration, by more than 0.1 pixel and 5 standard errors.
-        With `follow`: such a displacement remains.
+        With a fitted bench, also if a displacement explains what its prediction misses. With `follow`: such a
+        displacement remains.
 
     Examples
     --------

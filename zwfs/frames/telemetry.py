@@ -237,7 +237,8 @@ class _Job:
     def _row_type(self) -> np.dtype:
         columns: list[tuple] = [
             ("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
-            ("RESIDUAL", ">f4"), ("SHIFT", ">f4", (2,)), ("BACKGR", ">f4", (2,)), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4"),
+            ("RESIDUAL", ">f4"), ("SHIFT", ">f4", (2,)), ("BACKGR", ">f4", (2,)),
+            ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4"),
         ]  # fmt: skip
         columns += [("SIGMA", ">f4")] * self.has_sigma
         if self.matrix is not None:

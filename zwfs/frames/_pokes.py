@@ -236,10 +236,11 @@ def surroundings(calibration: Calibration, flat: NDArray, good: NDArray) -> tupl
     return around, float(np.vdot(around.astype(float), dark))
 
 
-def dark_of(calibration: Calibration) -> NDArray[np.floating]:
+def dark_of(calibration: Calibration) -> NDArray[np.float64]:
     """Counts without light, with the stray light, of the shape of an exposure."""
     stray = calibration.background if calibration.n_images == 2 else calibration.background.mean(keepdims=True)
-    return (calibration.dark + stray[:, np.newaxis, np.newaxis]).reshape(image_shape(calibration))
+    dark = calibration.dark.astype(float) + stray[:, np.newaxis, np.newaxis]
+    return dark.reshape(image_shape(calibration))
 
 
 def beyond_noise(level: float, weights: NDArray, far: NDArray) -> bool:

@@ -145,7 +145,7 @@ class Controller:
             raise ValueError(f"mask has shape {self.mask.shape}: expected (ny, nx) or (2, ny, nx)")
         if not self.mask.any():
             raise ValueError("mask is False at all pixels: expected some to be True")
-        n, n_commands = np.count_nonzero(self.mask), len(np.atleast_1d(matrix))
+        n, n_commands = int(np.count_nonzero(self.mask)), len(np.atleast_1d(matrix))
         around = np.zeros(self.mask.shape) if around is None else around
         self.around, self.stray = _single("around", around, self.mask.shape), _check.number("stray", stray)
         far = np.flatnonzero(self.around)
@@ -223,7 +223,7 @@ class Controller:
         if not (abs(light) < _check.LARGEST and self._raw.max() < self.saturation):
             light = self._repaired()
         self.flux, self.background = light / self.light, level / self._mean
-        self.lost = not light > self._faintest or (
+        self.lost = not light > self._faintest or bool(
             2 * self.background > self.flux and beyond_noise(level, self._weights, self._far)
         )
         if self.lost:

@@ -478,8 +478,8 @@ class Calibration(Immutable):
             of the calibration would have with the light and the noise of this one. With a `bench` it is 1.4 times
             the noise of this frame, the residual of the calibration or 0.0025, whichever is largest.
         judge : bool
-            Whether to compare the frames with their model. Without it residual and displacement are NaN, no frame
-            is inconsistent or moved, and the light follows from the mean of the frames alone.
+            Whether to compare the frames with their model. Without it residual, displacement and background are
+            NaN, no frame is inconsistent or moved, and the light follows from the mean of the frames alone.
         method : Reconstructor, optional
             Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``. With a
             `bench`, its frames are those of the last correction.

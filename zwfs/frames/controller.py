@@ -328,6 +328,7 @@ class PhaseController:
         self._stray = float(np.mean(self._work.offset.reshape(2, -1) @ self._mean))
         self._light: NDArray[np.float32] = np.ones(2, np.float32)
         self._light = self._on_grid(flat)[1] / np.float32(level.flux)
+        self._mean_light = float(self._light.mean())
         self._change, self._turns = np.empty((2, len(self._points)), np.float32)
         self.phase: NDArray[np.float32] = level.filled
         self.sigma = np.full(self.n_commands, np.nan)
@@ -354,9 +355,9 @@ class PhaseController:
         counts = _check.real_frame("counts", counts, image_shape(self._calibration))
         out = _check.destination("out", out, (self.n_commands,))
         frames, self.flux, self.n_bad = self._frames(counts, self._brightness() / self._flat_brightness)
-        far, mean = counts.take(self._far).astype(float), float(self._light.mean())
-        level = float(far @ self._weights) - self._stray_around
-        self.background = level / mean
+        far = counts.take(self._far).astype(np.float32)
+        level = float(far.dot(self._weights)) - self._stray_around
+        self.background = level / self._mean_light
         self.lost = not self.flux > self._faintest or (
             2 * self.background > self.flux and beyond_noise(level, self._weights, far)
         )

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import json
 import re
 import shutil
 import subprocess
@@ -15,6 +16,7 @@ from matplotlib.image import imread
 from nbformat.v4 import new_code_cell, new_notebook, new_output
 from PIL import Image
 
+from book._ext.run import SHARES
 from book._tools.run import FRONT_FIGURE
 from studies.kit.results import published
 
@@ -138,6 +140,15 @@ def test_cells_that_set_up_or_draw_are_folded_and_one_that_computes_is_not(path)
         assert hidden or not published(cell.source), cell.source
         computes |= not hidden and not shown
     assert computes
+
+
+def test_shares_of_time_are_those_of_cells_that_compute():
+    shares = json.loads(SHARES.read_text("utf-8"))
+    assert shares.keys() == {path.stem for path in NOTEBOOKS.glob("*.ipynb")}
+    for name, of_values in shares.items():
+        cells = nbformat.read(NOTEBOOKS / f"{name}.ipynb", 4).cells
+        for seconds in of_values.values():
+            assert {cells[int(number)].cell_type for number in seconds} == {"code"}, name
 
 
 def shown_code():

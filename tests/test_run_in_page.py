@@ -216,6 +216,26 @@ def test_figure_4_is_that_of_this_python_and_all_else_of_the_page_is_left_alone(
     assert figure4.said == []
 
 
+def test_the_time_left_is_that_of_all_sweeps(opened):
+    page = opened("notebooks/beyond_range.html")
+    page.page.evaluate("""() => {
+      window.told = [];
+      const status = document.querySelector(".run-details [role=status]");
+      new MutationObserver(() => told.push([performance.now() / 1000, status.textContent])).observe(
+        status, { childList: true });
+    }""")
+    page.open()
+    page.page.get_by_role("button", name="Quick values").click()
+    assert page.run().startswith("Done"), page.said
+    *told, (end, _) = page.page.evaluate("told")
+    lefts = [(at, re.search(r"about (\d+) s left$", text)) for at, text in told]
+    wrong = [abs(float(left[1]) - (end - at)) for at, left in lefts if left]
+    assert len(wrong) > 5, told
+    began = next(at for at, text in told if text.startswith("Cell"))
+    assert np.median(wrong) < (end - began) / 4, told
+    assert max(wrong) < end - began, told
+
+
 @pytest.mark.parametrize(
     "values", [{"n_screens": "1e3"}, {"more_iterations": "[0]"}, {"pupil": {"kind": "elt"}, "n_pixels": "16"}]
 )

@@ -14,7 +14,10 @@ from joblib import parallel_config
 
 from book._tools.declared import accept, accept_together, parameters
 from book._tools.notebook import BOOK
+from studies import fig09_bench_linearity, photon_noise
 from studies.kit import results
+from studies.kit.iteration import DARK_RING
+from studies.kit.methods import MASKS
 from studies.kit.tables import Table, Text
 
 NOTEBOOKS = Path(__file__).parent.parent / "notebooks"
@@ -23,6 +26,16 @@ SMALL = {"n_pixels": 24, "n_screens": 1, "n_modes": 15, "n_iterations": 3}
 NONSENSE = re.compile(r"(?<![\w.])-?(inf|nan)(?!\w)|\b(inf|nan) ?%|\b0\.0+ ?(±|rad\b|λ)", re.IGNORECASE)
 NUMBER = re.compile(r"(?<![\w.])\d+(?:\.\d+)?")
 TARGET = re.compile(r"\]\([^)]*\)|`[^`]*`")  # of a link, and code
+# For which value something was computed: in a sentence, and in the head of a table, its first column or a legend.
+SAID = re.compile(r"\b(?:[Aa]t|[Ii]n a band of) ([\d.]+(?:e[+-]?\d+)?) ?(rad\b|%|λ/D|photons)")
+LABEL = re.compile(r"(?:^|, |\bat |\binput )([\d.]+(?:e[+-]?\d+)?)(?: ?(rad\b|%|λ/D|photons)|$)")
+FIXED = {  # values that no parameter changes
+    "beyond_range": [DARK_RING, *(mask.diameter for masks in MASKS.values() for mask in masks)],
+    "calibration": [0.5],  # rad rms, of the recorded faint frames
+    "fig04_dimple_diameter": [DARK_RING],
+    "fig09_bench_linearity": [fig09_bench_linearity._SHARE],
+    "photon_noise": photon_noise.EXPECTED,
+}
 
 
 def run(name, given, monkeypatch):
@@ -60,6 +73,47 @@ def long_numbers(markdown):
         digits = number.replace(".", "").lstrip("0") if "." in number else number.strip("0")
         if len(digits) > 3 and not re.fullmatch(r"(19|20)\d\d", number):
             yield number
+
+
+def numbers_in(value):
+    """Numbers of a parameter."""
+    if isinstance(value, dict | list | tuple):
+        for part in value.values() if isinstance(value, dict) else value:
+            yield from numbers_in(part)
+    elif isinstance(value, int | float):
+        yield value
+
+
+def labels(computed, figures):
+    """Values, with their unit, for which text and figures say that something was computed."""
+    for output in computed:
+        if isinstance(output, Text):
+            yield from SAID.findall(output.markdown)
+        else:
+            for cell in [*output.header, *(row[0] for row in output.rows)]:
+                yield from LABEL.findall(str(cell))
+    for figure in figures:
+        legends = [*figure.legends, *(axes.get_legend() for axes in figure.axes)]
+        texts = [text for legend in legends if legend for text in legend.get_texts()]
+        texts += [text for axes in figure.axes for text in (axes.title, *axes.texts)]
+        for text in texts:
+            yield from LABEL.findall(text.get_text())
+
+
+def sampled(name, given, figures):
+    """Parameters of a run, and where its curves have points."""
+    notebook = nbformat.read(NOTEBOOKS / f"{name}.ipynb", as_version=4)
+    values = {key: one.default for key, one in parameters(notebook).items()} | given
+    lines = [np.ravel(line.get_xdata()) for figure in figures for axes in figure.axes for line in axes.lines]
+    return np.concatenate([list(numbers_in(values)), FIXED.get(name, []), *lines])
+
+
+def unsampled(labels, sampled):
+    """Labels of values, with their unit, that are no sampled value with two digits or more."""
+    written = [float(f"{value:.{digits}g}") for value in sampled for digits in (2, 3, 6)]
+    for number, unit in labels:
+        if not np.isclose(float(number) / (100 if unit == "%" else 1), written, rtol=1e-6).any():
+            yield f"{number} {unit}"
 
 
 def without_data(axes):
@@ -258,6 +312,10 @@ def test_text_of_odd_parameters_names_no_limit_that_does_not_exist(name, given, 
     assert not [said for said in sentences if any(long_numbers(said))]
     assert not [said for said in sentences if "$" in said]  # a run in the page sets no formulas
     assert not [figure for figure in figures if any(map(without_data, figure.axes))]
+    strange = set(unsampled(labels(computed, figures), sampled(name, given, figures)))
+    if "d_over_r0" in given.get("screens", {}):
+        strange = {label for label in strange if not label.endswith(" rad")}  # an rms that was measured
+    assert not strange
 
 
 @pytest.mark.parametrize(
@@ -269,6 +327,13 @@ def test_text_of_odd_parameters_names_no_limit_that_does_not_exist(name, given, 
 )
 def test_long_numbers_in_sentences_are_found(said, expected):
     assert list(long_numbers(said)) == expected
+
+
+def test_labels_of_values_that_were_not_sampled_are_found():
+    table = Table(["input", "at 2.6", "phase-shifted, 5 %"], [["0.8 rad", 1.0, 3.0]])
+    text = Text("At 0.5 rad rms it is wrong by 0.3 rad. In a band of 20 % and at 1000 photons it fails.")
+    said = labels([table, text], [])
+    assert list(unsampled(said, [0.3, 0.504, 2.5, 1e3])) == ["2.6 ", "5 %", "0.8 rad", "20 %"]
 
 
 @pytest.mark.parametrize("name", CASES)

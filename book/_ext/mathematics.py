@@ -19,6 +19,7 @@ CONVERTER = LatexToMathML(fancy_error=False)
 STYLE = Path(__file__).with_name("math.css")
 FONT = STYLE.with_suffix(".woff2")
 SPACING = re.compile(r"(?<=\\\\)\[[\d.]+e[mx]\]")  # after a row: math-core would print it
+MARK = re.compile(r"[.,;:!?)\]]+")  # may not begin a line
 LOGGER = logging.getLogger(__name__)
 
 
@@ -49,6 +50,16 @@ def mathml(node: nodes.math | nodes.math_block) -> str:
         return html.escape(text)
 
 
+def keep_marks(app: Sphinx, tree: nodes.document, page: str) -> None:
+    """Keep the mark after a formula on its line: browsers may begin a line after any formula."""
+    for formula in list(tree.findall(nodes.math)):
+        line, place = formula.parent, formula.parent.index(formula)
+        after = line[place + 1] if place + 1 < len(line) else ""
+        if isinstance(after, nodes.Text) and (mark := MARK.match(after)):
+            together = nodes.inline("", "", formula, nodes.Text(mark[0]), classes=["unbroken"])
+            line[place : place + 2] = [together, nodes.Text(after[mark.end() :])]
+
+
 def add_style(app: Sphinx, page: str, template: str, context: dict[str, Any], tree: nodes.document) -> None:
     """Load the style of formulas on pages that have some."""
     if "<math" in context.get("body", ""):
@@ -66,6 +77,7 @@ def write_style(app: Sphinx, exception: Exception | None) -> None:
 def setup(app: Sphinx) -> dict[str, bool]:
     """Offer the renderer, which `html_math_renderer` names."""
     app.add_html_math_renderer("mathml", (visit_inline, None), (visit_block, None))
+    app.connect("doctree-resolved", keep_marks)
     app.connect("html-page-context", add_style)
     app.connect("build-finished", write_style)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

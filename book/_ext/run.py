@@ -32,6 +32,7 @@ COPY = "_static/pyodide"
 DATA = "_static/run"
 REPOSITORY = "_static/zwfs.zip"
 KNOWN = Path(__file__).with_name("pyodide.json")  # sizes and digests of the version that this book uses
+SHARES = Path(__file__).with_name("shares.json")  # seconds of the cells and sweeps, see environment/shares.py
 FOLDERS = ("book", "environment", "notebooks", "tests", "zwfs")
 PURE = "array-api-compat", "markdown-it-py", "mdurl"  # packages that Pyodide does not have
 SCRIPTS = ("run/settings.js", "run-worker.js", "run-form.js", "run.js")
@@ -70,6 +71,7 @@ def described(notebook: NotebookNode, name: str) -> dict[str, Any]:
         "name": name,
         "parameters": {key: field(parameter) for key, parameter in declared.parameters(notebook).items()},
         "quick": getattr(study, "QUICK", {}),
+        "shares": json.loads(SHARES.read_text("utf-8")).get(name, {"book": {}, "quick": {}}),
         "figures": {
             figure: number
             for number, cell in enumerate(cells)

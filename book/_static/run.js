@@ -11,7 +11,7 @@
   const onDisk = location.protocol === "file:";
   const place = new URL(settings.place, new URL("..", folder)).href;
   const KINDS = { "csv": "text/csv", "screens.csv": "text/csv", "png": "image/png", "pdf": "application/pdf", "svg": "image/svg+xml" };
-
+  const START = 0.2; // share of a run before which it says no time left
   class Stopped extends Error {}
 
   const loadScript = (name) => new Promise((done, failed) => {
@@ -251,12 +251,10 @@
     async cells(last) {
       const cells = notebook.notebook.cells;
       const all = cells.map((_, number) => number).filter((number) => this.runs(cells[number]) && number <= last);
-      for (const number of all.filter((one) => one >= this.next)) {
-        const label = `Cell ${all.indexOf(number) + 1} of ${all.length}`;
-        this.status.textContent = `${label} …`;
-        this.bar.max = all.length;
-        this.bar.value = all.indexOf(number);
-        this.watch(label, all.indexOf(number));
+      const rest = all.filter((number) => number >= this.next);
+      const tell = this.meter(rest);
+      for (const number of rest) {
+        tell(`Cell ${all.indexOf(number) + 1} of ${all.length}`, number);
         const shown = await python.call("cell", { source: cells[number].source });
         if (shown.error) throw new Error(shown.error);
         putOutput(number, shown);
@@ -273,16 +271,29 @@
       return cell.cell_type === "code" && !tags.includes("parameters");
     }
 
-    // Tell the progress of the sweeps of a cell. How many sweeps follow is not known: the time left is that of one.
-    watch(label, before) {
-      let count = 0;
-      let began = performance.now();
-      python.onProgress = ({ done, total }) => {
-        if (done === 1) count += 1;
-        const left = Math.ceil((performance.now() - began) / done * (total - done) / 1000);
-        this.status.textContent = `${label}, sweep ${count}: task ${done} of ${total}, about ${left} s left in this sweep`;
-        this.bar.value = before + done / total;
-        if (done === total) began = performance.now();
+    // Tell the progress through cells. How their time divides among the sweeps was measured with the values of the book
+    // and with the quick ones (environment/shares.py); the time so far says how fast it is here.
+    meter(numbers) {
+      const same = ([name, value]) => name in this.values && JSON.stringify(JSON.parse(this.values[name])) === JSON.stringify(value);
+      const quick = Object.entries(notebook.quick);
+      const seconds = notebook.shares[quick.filter(same).length > quick.length / 2 ? "quick" : "book"];
+      const sum = (parts) => parts.reduce((before, part) => before + part, 0);
+      const whole = sum(numbers.flatMap((number) => seconds[number] ?? []));
+      const began = performance.now();
+      const tell = (text, done) => {
+        const left = Math.ceil((performance.now() - began) * (whole / done - 1) / 1000);
+        this.status.textContent = `${text}${done > START * whole ? `, about ${left} s left` : " …"}`;
+        this.bar.value = done / (whole || 1);
+      };
+      return (label, number) => {
+        const parts = seconds[number] ?? [];
+        const before = sum(numbers.filter((one) => one < number).flatMap((one) => seconds[one] ?? []));
+        let sweep = 0;
+        tell(label, before);
+        python.onProgress = ({ done, total }) => {
+          tell(`${label}, task ${done} of ${total}`, before + sum(parts.slice(0, sweep)) + (parts[sweep] ?? 0) * (done / total));
+          if (done === total) sweep += 1;
+        };
       };
     }
 

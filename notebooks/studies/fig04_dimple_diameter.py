@@ -294,20 +294,20 @@ def _rise(curve: DiameterCurves, name: str, allowed: float) -> float:
 
 
 def methods_table(curves: Mapping[str, DiameterCurves], threshold: float) -> Table:
-    """Errors of the methods at some diameters, and the diameters at which they rise."""
+    """Errors of the methods at some sampled diameters, and the diameters at which they rise."""
+    sampled = next(iter(curves.values()))
+    usual = _usual(sampled)
+    places = [usual, *(diameter for diameter in (2.0, 2.6, 3.5) if usual < diameter <= sampled.diameters[-1])]
     return Table(
         [
             "method",
-            "error at 1.06",
-            "at 2",
-            "at 2.6",
-            "at 3.5 (λ/D)",
-            f"exceeds {percent(threshold)}, or twice the error at 1.06, above about (λ/D)",
+            *f"error {', '.join(f'at {diameter:.4g}' for diameter in places)} (λ/D)".split(", "),
+            f"exceeds {percent(threshold)}, or twice the error at {usual:.4g}, above about (λ/D)",
         ],
         [
             [
                 LOOKS[name].name,
-                *(small(curve.at(name, diameter)) for diameter in (USUAL, 2.0, 2.6, 3.5)),
+                *(small(curve.at(name, diameter)) for diameter in places),
                 _rise(curve, name, threshold * curve.rms[0]),
             ]
             for name, curve in curves.items()

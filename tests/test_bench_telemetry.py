@@ -201,6 +201,13 @@ def test_linear_method_measures_small_screens_on_a_fitted_bench(recorded, calibr
 # Images that have moved
 
 
+def test_fitted_bench_shows_that_images_have_moved(recorded, calibration):
+    moved = replace(recorded.bench, offsets=tuple((row + 0.3, column) for row, column in recorded.bench.offsets))
+    exposures = [moved.counts(moved.smooth(0.4, 1000 + index), (7, index)) for index in range(6)]
+    flags = calibration(wide(np.stack(exposures))).flags & Flag.MOVED
+    assert np.count_nonzero(flags) >= 4  # some phases imitate a displacement
+
+
 class Drifting:
     """Exposures of a bench with hot pixels, whose images have moved since the calibration."""
 

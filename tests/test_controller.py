@@ -155,6 +155,26 @@ def test_frame_without_light_gives_no_command(camera, calibration, pokes, method
     assert not control.lost
 
 
+@pytest.mark.parametrize("method", ["linear", "phase-shifted"])
+def test_frame_without_a_pupil_gives_no_command(camera, calibration, pokes, method):
+    control = calibration.controller(*pokes, poke=POKE, method=method)
+    rng = np.random.default_rng(1)
+    for level in (100, 1e4, 1e6):
+        for counts in (np.full(calibration.shape, level), rng.poisson(level, calibration.shape)):
+            assert not control(np.minimum(DARK + counts, 65534)).any()
+            assert control.lost
+
+
+@pytest.mark.parametrize("method", ["linear", "phase-shifted"])
+def test_background_that_has_risen_is_measured(camera, calibration, pokes, truth, method):
+    control = calibration.controller(*pokes, poke=POKE, method=method)
+    for risen in (0.0, 0.1):
+        control(camera(truth, 9) + risen * camera.photons)
+        # Behind the masks, the flat mirror has about half of the light of a clear frame.
+        assert control.background == pytest.approx(2 * risen, abs=0.05)
+        assert not control.lost
+
+
 def test_noisy_pokes_do_not_lower_the_gain(camera, calibration, controller, truth):
     faint = calibration.controller(*Camera(photons=100).pokes(), poke=POKE, gain=1.0)
     exact, noisy = (
@@ -178,6 +198,7 @@ def test_file_holds_plain_arrays_and_makes_the_same_controller(tmp_path, camera,
     read = Controller.load(tmp_path / name)
     counts = camera(truth, 9)
     np.testing.assert_array_equal(read(counts), controller(counts))
+    assert read.background == pytest.approx(controller.background) != 0
     assert repr(read) == repr(controller)
     assert read.expected_residual == pytest.approx(controller.expected_residual)
     # As other software applies it.

@@ -19,6 +19,7 @@ import pytest
 from astropy.io import fits
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import ndimage
 
 from zwfs import (
     Dimple,
@@ -320,6 +321,30 @@ def test_images_that_have_moved_are_flagged(bench, calibration, moved, flags):
     estimate = calibration(np.roll(bench.frames, moved, axis=(1, 2)))
     assert np.all(estimate.flags & Flag.MOVED == flags)
     np.testing.assert_allclose(estimate.displacement, [moved] * 12, atol=0.5)
+
+
+def test_background_that_has_risen_is_measured_and_flagged(bench, calibration):
+    risen = calibration(bench.frames + 0.06 * PHOTONS)
+    assert (risen.flags & Flag.INCONSISTENT).all()
+    np.testing.assert_allclose(risen.background, 0.06, atol=0.02)
+    np.testing.assert_allclose(calibration(bench.frames).background, 0, atol=0.01)
+
+
+@pytest.mark.parametrize("level", [30, 1e3, 1e4, 1e6])
+def test_frame_without_a_pupil_is_flagged(bench, calibration, level):
+    shape = calibration.shape
+    frames = np.stack([np.full(shape, level), bench.rng.poisson(level, shape), bench.rng.normal(0, level, shape)])
+    assert (calibration(frames + DARK, saturation=np.inf).flags & (Flag.LOST | Flag.INCONSISTENT) > 0).all()
+
+
+def test_background_is_unknown_where_no_pixel_around_the_pupils_is_good(bench, calibration):
+    far = np.ones(calibration.bad.shape, bool)
+    for row, column in calibration.places[:, :, calibration.good].reshape(2, 2, -1):
+        far[0, np.rint(row).astype(int), np.rint(column).astype(int)] = False
+    far = ndimage.binary_erosion(far, iterations=2, border_value=1)
+    estimate = replace(calibration, bad=calibration.bad | far)(bench.frames)
+    assert np.isnan(estimate.background).all()
+    assert not estimate.flags.any()
 
 
 def test_header_states_units_and_the_place_of_the_map(folder, calibration):

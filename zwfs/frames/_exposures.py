@@ -29,6 +29,7 @@ _LAMP = (
 )  # light in the pupil, over that of the calibration's frames, that other phases can make of its lamp
 _EXACT, _EXACT_OF_BENCH = 1e-3, 2.5e-3  # residuals of frames without noise
 MOVED_BY, SURE = 0.1, 5.0  # pixels and standard errors, of a displacement
+_STRAY = 0.03  # of a clear frame, by which the background may rise; errors of models reach half of that
 _SAME_LIGHT = 0.01  # relative difference of the light of frames and of their model that means little
 # Cost of an explanation that is good enough, and factor of the usual residual above which frames are inconsistent.
 _ENOUGH = 2.25, 2.5
@@ -54,6 +55,7 @@ class Trial(NamedTuple):
     usual: NDArray[np.float64]  # (k,), of frames like those of the calibration
     ratio: NDArray[np.float64]  # (k,), light of the frames over that of their model
     cost: NDArray[np.float64]  # (k,), of both: 1 for frames like those of the calibration
+    moved: NDArray[np.bool_]  # (k,), as the prediction of a bench shows it
 
     def improved(self, which: NDArray[np.intp], rival: Trial, factor: float = 1.0) -> NDArray[np.bool_]:
         """Take over those of some exposures that cost less than a part of what they cost here."""
@@ -118,9 +120,13 @@ class Exposures:
         trial = self._attempt(np.arange(len(same)), np.where(same, 1.0, self.relative) if light is None else light)
         if light is None and self._judge:
             self._explain(trial)
-        residual, displacement, moved = self._compared(trial)
+        residual, displacement, moved, background, stray = self._compared(trial)
         limits = self._unusual * trial.usual if limit is None else limit
-        flags = _BAD * (self.n_bad > 0) + _SATURATED * (self.n_saturated > 0) + INCONSISTENT * (residual > limits)
+        flags = (
+            _BAD * (self.n_bad > 0)
+            + _SATURATED * (self.n_saturated > 0)
+            + INCONSISTENT * (stray | (residual > limits))
+        )
         flags += np.where(self.lit, _NOT_CONVERGED * (~trial.converged & (self._of.tolerance > 0)), _LOST)
         return Phases(
             phase=np.where(self.good & self.lit[:, np.newaxis, np.newaxis], trial.phase, np.float32(np.nan)),
@@ -130,6 +136,7 @@ class Exposures:
             n_saturated=self.n_saturated,
             residual=residual,
             displacement=displacement,
+            background=background,
             n_iterations=trial.n_iterations,
             n_unsolved=trial.n_unsolved,
             flags=flags + MOVED * moved,
@@ -152,15 +159,16 @@ class Exposures:
             if self._method:
                 solved = work.solve(corrected.quiet, good, start, self._method)
         usual, (residual, ratio) = self._usual(light, self.noise[which]), np.full((2, len(which)), np.nan)
+        moved = np.zeros(len(which), bool)
         if self._judge:
             residual, ratio = work.compared(solved.phase, frames, good)
         if self._judge and corrected and not self._method:  # counts are compared, not ideal frames
-            residual = corrected.residual
+            residual, moved = corrected.residual, corrected.moved
             usual = np.maximum(corrected.noise, max(self._of.residual, _EXACT_OF_BENCH))
         ratio = ratio / self._of.light_ratio
         unsure = np.hypot(_SAME_LIGHT, 2 * usual / np.sqrt(self.n_good[which]))
         cost = np.where(self.lit[which], (residual / usual) ** 2 + ((ratio - 1) / unsure) ** 2, 0)
-        return Trial(light, solved.phase, frames, *solved[1:], residual, usual, ratio, cost)
+        return Trial(light, solved.phase, frames, *solved[1:], residual, usual, ratio, cost, moved)
 
     def _explain(self, best: Trial) -> None:
         """Improve the light of those exposures that their first light does not explain."""
@@ -178,19 +186,29 @@ class Exposures:
                 best.improved(poor, self._attempt(poor, best.light[poor] * factor), _BETTER)
             poor = poor[best.cost[poor] > self._enough]
 
-    def _compared(self, trial: Trial) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        """Residuals, displacements, and whether an exposure has moved; NaN where it is lost or not judged."""
-        lit, usual = self.lit, self._of.displacements
-        residual, displacement, sigma = (
-            np.full((len(lit), *size), np.nan, np.float32) for size in ((), (2,), (2,))
+    def _compared(self, trial: Trial) -> tuple[NDArray, ...]:
+        """Residuals, displacements and whether one is significant, backgrounds and whether one is.
+
+        NaN where an exposure is lost or not judged.
+        """
+        usual, work, k = self._of.displacements, self._work, len(self.lit)
+        lit = slice(None) if self.lit.all() else self.lit  # a slice copies nothing
+        residual, displacement, sigma, background = (
+            np.full((k, *size), np.nan, np.float32) for size in ((), (2,), (2,), (2,))
         )
-        if self._judge and lit.any():
-            residual[lit] = trial.residual[lit]
-            shift, sigma[lit] = self._work.displaced(trial.phase[lit], trial.frames[lit], self.good[lit])
+        stray = np.zeros(k, bool)
+        if self._judge and self.lit.any():
+            residual[lit], steady = trial.residual[lit], work.steady(trial.phase[lit])
+            shift, sigma[lit] = work.displaced(steady, trial.frames[lit], self.good[lit])
             displacement[lit] = shift - (usual.mean(axis=0) if len(usual) else 0)
+            unit = self._of.unit * trial.light[lit, np.newaxis]
+            levels, errors = work.background(self._raw[lit], steady, unit)
+            levels -= self._of.around
+            background[lit] = levels.max(axis=0)
+            stray[lit] = np.any(levels > np.maximum(_STRAY, SURE * errors), axis=(0, 2))
         scatter = usual.std(axis=0) if len(usual) else 0
         moved = np.abs(displacement) > np.maximum(MOVED_BY, SURE * np.hypot(sigma, scatter))
-        return residual, displacement, np.any(moved, axis=1)
+        return residual, displacement, trial.moved | moved.any(axis=1), background, stray
 
     def _dark_noise(self, counts: NDArray, flux: NDArray) -> NDArray[np.float64]:
         """Noise of dark pixels over `unit`, (k, 2), of exposures so faint that it counts; else 0."""

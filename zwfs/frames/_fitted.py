@@ -129,6 +129,7 @@ def smooth_phases(
         n_saturated=n_saturated,
         residual=unknown,
         displacement=np.stack([unknown, unknown], axis=-1),
+        background=np.stack([unknown, unknown], axis=-1),
         n_iterations=zero,
         n_unsolved=zero,
         flags=np.asarray(flags, int),

@@ -38,7 +38,7 @@ def checked_follow(follow: bool, calibration: Calibration) -> bool:
 def followed(exposures: Exposures, light: NDArray | None, limit: float | None) -> Phases:
     """Phases as `Exposures.phases` returns them, with images moved back whose displacement is significant."""
     phases = exposures.phases(light, limit)
-    doubtful = np.any(np.abs(phases.displacement) > MOVED_BY, axis=1) | (phases.flags & INCONSISTENT > 0)
+    doubtful = np.any(np.abs(phases.displacement) > MOVED_BY, axis=1) | (phases.flags & (INCONSISTENT | MOVED) > 0)
     if not doubtful.any():
         return phases
     parts = []

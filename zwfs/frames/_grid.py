@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 _FAR = 16  # pixels to which an edge is repeated
 _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
 _RIM = 2  # pixels on both sides of the edge of the pupil, from which its place follows
+_AWAY = 3  # pixels from the light of a pupil, from which on pixels show the background
+_FEWEST, _MOST = 16, 200  # of these pixels
+_STEEPEST = 1.2  # light of these pixels over that of a model, without a background
+_OUTLYING = 4.0  # residual of a line over their rms, above which a pixel does not count
 _CUT = _REACH - 1 - _RIM  # of these, those without a coefficient of a spline in the pupil or its rim
 _NOISE = 0.2  # of the signal, in squares: the inverse of a blur goes no further
 _STRAIGHT = 0.02  # pixels by which the places of a row or a column may differ from its mean
@@ -98,7 +102,7 @@ class Grid:
         inner = ndimage.binary_erosion(pupil.inside)
         self._near, rim = near.ravel().astype(float), near & ~inner
         rim[[0, -1]] = rim[:, [0, -1]] = False  # a slope needs neighbours
-        self.rim = np.flatnonzero(rim)
+        self.rim, self._outside = np.flatnonzero(rim), ~pupil.inside
         self.beyond = ~pupil.inside.ravel()[self.rim]  # points of the rim outside the pupil
         self.edge = _repair(pupil.inside & ~inner, inner)  # points of the edge, and the nearest ones off it
         self._place(calibration, calibration.places)
@@ -137,8 +141,24 @@ class Grid:
         reached = np.stack([matrix.sum(axis=0) > 0 for matrix in self.touching])
         self.watched = reached.reshape(bad.shape) & ~bad  # good pixels from which the pupil is made
         self.dim = ~reached.reshape(bad.shape) & ~bad  # good pixels around it
+        self._watch(calibration, points, low, size)
         # Bad pixels of each box with their nearest good ones.
         self.repairs = [_repair(pixels, ~pixels) for pixels in bad]
+
+    def _watch(self, calibration: Calibration, points: NDArray, low: NDArray, size: NDArray) -> None:
+        """Set the points far from both pupils, and the pixels of the boxes there, that show the background."""
+        reached = pixels_around(points[:, :, ~self._outside], calibration.n_images, calibration.shape)
+        dark = ~ndimage.binary_dilation(reached, np.ones((1, 3, 3)), _AWAY) & ~calibration.bad
+        nearest, far = np.rint(points).astype(int), self._outside
+        for (image, *_), pixels in zip(self.boxes, nearest, strict=True):
+            on_camera = np.all((pixels >= 0) & (pixels < np.reshape(calibration.shape, (2, 1, 1))), axis=0)
+            far = far & on_camera & dark[(image, *np.where(on_camera, pixels, 0))]
+        chosen = np.flatnonzero(far)
+        self.far = chosen[:: 1 + len(chosen) // _MOST] if len(chosen) >= _FEWEST else chosen[:0]
+        rows, columns = nearest.reshape(2, 2, -1)[..., self.far].transpose(1, 0, 2)
+        self.far_pixels = (rows - low[:, :1]) * size[1] + columns - low[:, 1:]
+        images = np.reshape([box[0] for box in self.boxes], (2, 1))
+        self.far_on_camera = np.ravel_multi_index((images, rows, columns), calibration.bad.shape)
 
     def _ignore(self, good: NDArray[np.bool_]) -> None:
         """Set the good points, and bad ones of the pupil with their nearest good ones."""
@@ -218,29 +238,46 @@ class Grid:
         with np.errstate(invalid="ignore", divide="ignore"):  # no point of a lost frame may be good
             return np.sqrt(squares / (2 * pupil.n_points)), light / expected
 
-    def displaced(self, phase: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
+    def steady(self, phase: NDArray) -> NDArray:
+        """Frames of phases, (k, 2, ny, nx), whose edge has the phase of points farther inside."""
+        inner = phase.reshape(len(phase), -1).copy()
+        inner[:, self.edge[0]] = inner[:, self.edge[1]]
+        return self.modelled(inner.reshape(phase.shape))
+
+    def displaced(self, steady: NDArray, frames: NDArray, good: NDArray) -> tuple[NDArray, NDArray]:
         """Displacement of both images on frames (k, 2, ny, nx), (k, 2) in pixels, and its standard error.
 
-        The rim of the pupil moves with the images. A phase at the edge could follow it, so that of points farther
-        inside takes its place. It is wrong by a little, which changes the two images in opposite directions, so
-        only their sum counts.
+        The rim of the pupil moves with the images. A phase at the edge could follow it, hence the `steady` frames.
+        They are wrong by a little, which changes the two images in opposite directions, so only their sum counts.
         """
-        k, (_, width) = len(phase), phase.shape[1:]
-        steady = phase.reshape(k, -1).copy()
-        steady[:, self.edge[0]] = steady[:, self.edge[1]]
-        modelled, measured = (
-            pair.sum(axis=1).reshape(k, -1) for pair in (self.modelled(steady.reshape(phase.shape)), frames)
-        )
+        k, width = len(frames), frames.shape[3]
+        modelled, measured = (pair.sum(axis=1).reshape(k, -1) for pair in (steady, frames))
         weight = good.reshape(k, -1)[:, self.rim] | self.beyond
         around = ((self.rim + step, self.rim - step) for step in (width, 1))
         slopes = weight * np.stack([(modelled[:, after] - modelled[:, before]) / 2 for after, before in around])
         missing = weight * (modelled - measured)[:, self.rim]
-        normal = np.vecdot(slopes[:, np.newaxis], slopes).transpose(2, 0, 1)
-        inverse = np.linalg.pinv(normal.astype(float), hermitian=True)
+        normal = np.vecdot(slopes[:, np.newaxis], slopes).transpose(2, 0, 1).astype(float)
+        ridge = 1e-9 * np.trace(normal, axis1=1, axis2=2)[:, np.newaxis, np.newaxis] + 1e-30
+        inverse = np.linalg.inv(normal + ridge * np.eye(2))  # a pseudo-inverse takes ten times as long
         shift = (inverse @ np.vecdot(slopes, missing).T[..., np.newaxis])[..., 0]
         missing -= np.einsum("ka,akp->kp", shift, slopes)
         variance = np.vecdot(missing, missing) / np.maximum(weight.sum(axis=1) - 2, 1)
         return shift, np.sqrt(variance[:, np.newaxis] * inverse[:, (0, 1), (0, 1)])
+
+    def background(self, raw: NDArray, modelled: NDArray, unit: NDArray) -> tuple[NDArray, NDArray]:
+        """Uniform light around the pupils that no phase explains, and its standard error; NaN if unknown.
+
+        Diffracted light falls with the distance from the pupil. So the background is the constant of a line that
+        gives the light of far pixels from modelled frames, (k, 2, ny, nx), whatever part of their light is there.
+        The first result, (2, k, 2), has the best line, and the steepest one possible. The latter gives a lower
+        limit with less noise. The pixels are those of boxes, (k, 2, h, w), and the units, (k, 2), are counts.
+        """
+        if not self.far.size:
+            return np.full((2, len(raw), 2), np.nan), np.full((2, len(raw), 2), np.nan)
+        values = np.stack([raw[:, i].reshape(len(raw), -1)[:, far] for i, far in enumerate(self.far_pixels)], 1)
+        return _constant(
+            values / unit[..., np.newaxis].astype(np.float32), modelled.reshape(len(raw), 2, -1)[..., self.far]
+        )
 
     def modelled(self, phase: NDArray) -> NDArray:
         """Frames of phases on the grid of the pupil, (k, 2, ny, nx)."""
@@ -354,6 +391,39 @@ class Straight:
             for onto, read, part in pupil.columns:
                 np.matmul(pupil.half[:, read], part.T, out=values[:, onto])
         return self._values
+
+
+def pixels_around(places: NDArray, n_images: int, shape: tuple[int, int]) -> NDArray[np.bool_]:
+    """Pixels of n_images camera images of a shape next to places, (2, 2, n): rows and columns on both frames."""
+    reached = np.zeros((n_images, *shape), bool)
+    for index, corner in enumerate(np.floor(places).astype(int)):
+        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
+            row, column = corner + np.reshape(step, (2, 1))
+            inside = (row >= 0) & (row < shape[0]) & (column >= 0) & (column < shape[1])
+            reached[min(index, n_images - 1), row[inside], column[inside]] = True
+    return reached
+
+
+def _constant(values: NDArray, model: NDArray) -> tuple[NDArray, NDArray]:
+    """Constants of lines from model to values along the last axis, and their standard errors, without outliers.
+
+    The first line fits the values best, the second is the steepest one that they may have.
+    """
+    weight = np.ones_like(values)
+    for _ in range(2):
+        n = weight.sum(axis=-1, keepdims=True)
+        level, middle = (np.vecdot(weight, array)[..., np.newaxis] / n for array in (values, model))
+        away, missing = weight * (model - middle), weight * (values - level)
+        spread = np.maximum(np.vecdot(away, away)[..., np.newaxis], 1e-12)
+        slope = np.vecdot(away, missing)[..., np.newaxis] / spread
+        missing -= slope * away
+        variance = np.vecdot(missing, missing)[..., np.newaxis] / np.maximum(n - 2, 1)
+        usual = np.abs(missing) <= _OUTLYING * np.sqrt(variance)
+        if usual.all():
+            break
+        weight *= usual
+    constants = np.stack([level - slope * middle, level - _STEEPEST * middle])
+    return constants[..., 0], np.sqrt(variance * np.stack([1 / n + middle**2 / spread, 1 / n]))[..., 0]
 
 
 def _span(low: int, size: int, length: int) -> Any:

@@ -17,6 +17,7 @@ from scipy import fft, ndimage
 
 from zwfs._images import radius
 from zwfs.frames._errors import slopes_of, unexplained
+from zwfs.frames._exposures import SURE
 from zwfs.frames._fit import BenchFit, places_of
 from zwfs.frames._fitted import FittedSensor, Windows
 from zwfs.frames.pipeline import Optics, unmixed
@@ -61,9 +62,11 @@ def of_bench(
     images = windows.on_camera(np.nan_to_num(counts)) + calibration.dark
     # The lamp is that of the calibration, so its light is known.
     measured = calibration(images if windows.n_images == 2 else images[:, 0], light=1.0, saturation=np.inf)
+    around, scatter = measured.background.mean(axis=0), measured.background.std(axis=0)
     return replace(
         calibration, unexplained=unexplained(measured.phase, phases), slopes=slopes_of(measured.filled, good),
         displacements=measured.displacement.astype(float), residual=float(np.nanmax(measured.residual)),
+        around=np.where(np.abs(around) > SURE * scatter / np.sqrt(len(images)), around, 0),
     )  # fmt: skip
 
 

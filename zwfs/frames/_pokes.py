@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from zwfs import _check
 from zwfs._system import path_of
+from zwfs.frames._grid import pixels_around
 from zwfs.frames._stack import Stack
 from zwfs.frames.phases import Flag
 
@@ -24,6 +25,8 @@ _CLEAR = 4.0  # response over its noise, in squares, from which on two responses
 _SILENT = 1e-6  # response to a poke over that of a typical one, in squares: nothing, where there is no noise
 _UNSEEN = 1.05  # singular value over that of noise alone, below which a direction is noise
 _LOST = 5.0  # standard errors of the light, below which a frame has none
+_MOST_AROUND = 128  # pixels that show the background
+_FLAT = 0.01  # relative variance of their light in the frame of the flat mirror, with which they do not
 _FEWEST = 0.8  # of the pixels that the pupil covers, which are good in all frames of the pokes
 
 
@@ -128,8 +131,7 @@ class Signals(NamedTuple):
                 f"flat, pushed, pulled: {np.count_nonzero(mask)} of the {n_pixels} pixels of the pupils are good "
                 f"in all frames: expected {100 * _FEWEST:.0f} % of them, none of them NaN or saturated"
             )
-        stray = calibration.background if calibration.n_images == 2 else calibration.background.mean(keepdims=True)
-        dark = (calibration.dark + stray[:, np.newaxis, np.newaxis]).reshape(mask.shape)[mask]
+        dark = dark_of(calibration)[mask]
         signals, lights = [], []
         for name, images in (("flat", pokes.flats), ("pushed", pokes.pushed), ("pulled", pokes.pulled)):
             values = images[:, mask] - dark
@@ -212,14 +214,38 @@ def faintest(noise: float, n_pixels: int) -> float:
 
 def _pixels(calibration: Calibration) -> NDArray[np.bool_]:
     """Good pixels of the camera next to a point of the pupil, in either image."""
-    mask = np.zeros((calibration.n_images, *calibration.shape), bool)
-    for index, places in enumerate(calibration.places):
-        low = np.floor(places[:, calibration.amplitude > 0]).astype(int)
-        for step in ((0, 0), (0, 1), (1, 0), (1, 1)):
-            row, column = (low.T + step).T
-            inside = (row >= 0) & (row < calibration.shape[0]) & (column >= 0) & (column < calibration.shape[1])
-            mask[min(index, calibration.n_images - 1), row[inside], column[inside]] = True
-    return (mask & ~calibration.bad).reshape(image_shape(calibration))
+    places = calibration.places[:, :, calibration.amplitude > 0]
+    around = pixels_around(places, calibration.n_images, calibration.shape)
+    return (around & ~calibration.bad).reshape(image_shape(calibration))
+
+
+def surroundings(calibration: Calibration, flat: NDArray, good: NDArray) -> tuple[NDArray[np.float32], float]:
+    """Weights of pixels around the pupils, of the shape of an exposure, and what they make of the dark, counts.
+
+    The weighted sum of a frame, less that of the dark, is the background: the constant of a line from the light of
+    the frame of the flat mirror to that of the frame. The weights are 0 where too few pixels show it.
+    """
+    pixels = np.unique(calibration._work.far_on_camera)
+    pixels = pixels[good.ravel()[pixels]]
+    pixels = pixels[:: 1 + len(pixels) // _MOST_AROUND]
+    dark, around = dark_of(calibration), np.zeros(good.shape, np.float32)
+    light = (flat - dark).ravel()[pixels]
+    weights = 1 - light * light.sum() / max(light @ light, 1e-30)
+    if weights.sum() > _FLAT * len(pixels):
+        around.ravel()[pixels] = weights / weights.sum()
+    return around, float(np.vdot(around.astype(float), dark))
+
+
+def dark_of(calibration: Calibration) -> NDArray[np.float64]:
+    """Counts without light, with the stray light, of the shape of an exposure."""
+    stray = calibration.background if calibration.n_images == 2 else calibration.background.mean(keepdims=True)
+    dark = calibration.dark.astype(float) + stray[:, np.newaxis, np.newaxis]
+    return dark.reshape(image_shape(calibration))
+
+
+def beyond_noise(level: float, weights: NDArray, far: NDArray) -> bool:
+    """Whether a background is more than the scatter of pixels explains."""
+    return level > _LOST * float(np.linalg.norm(weights) * far.std())
 
 
 def _frames_of(name: str, value: Any, calibration: Calibration) -> NDArray:

@@ -33,6 +33,9 @@ _N_CORRECTIONS = 2  # the next ones gain little
 _SMOOTHING = 0.5  # pixels rms, of residuals
 _AROUND = 2.0  # pixels rms, of the neighbours whose residuals are compared with their noise
 _FULLY_LIT = 0.9  # share of the light of a pixel
+# Pixels and standard errors of a displacement that residuals show. It is a tenth to nine tenths of the true one,
+# as the phase follows it, and errors of the model pretend up to 0.05.
+_MOVED_BY, _SURE = 0.07, 5.0
 _FEWEST = 30  # points without a neighbour that is lit in part: with fewer, edges count, too
 
 
@@ -44,6 +47,7 @@ class Corrected(NamedTuple):
     solved: Solved
     residual: NDArray[np.float64]  # (k,), rms of counts less their prediction away from edges, 1 = clear frame
     noise: NDArray[np.float64]  # (k,), that of noise alone
+    moved: NDArray[np.bool_]  # (k,), whether a displacement of the images explains a part of the residual
 
 
 class Prediction:
@@ -124,7 +128,9 @@ class Prediction:
         ]
         parts = residual, _significant(residual, shown, usable)
         frames, quiet = (self._ideal(solved.phase, missing / scale) for missing in parts)
-        return Corrected(frames, quiet, solved._replace(n_iterations=n_iterations), *rms)
+        push, sigma = _push(raw - residual, residual, (usable & grid.watched) / variance)
+        moved = np.any(np.abs(push) > np.maximum(_MOVED_BY, _SURE * sigma), axis=1)
+        return Corrected(frames, quiet, solved._replace(n_iterations=n_iterations), rms[0], rms[1], moved)
 
     def _ideal(self, phase: NDArray, missing: NDArray) -> NDArray[np.float32]:
         """Frames of an ideal sensor, (k, 2, ny, nx): those of phases, and counts of the boxes that they miss."""
@@ -197,6 +203,18 @@ def _excess(pulls: NDArray, where: NDArray[np.bool_]) -> NDArray[np.float64]:
     steps = np.abs(np.diff(pulls, axis=3))
     medians = [np.median(step[pair]) if pair.any() else 0.0 for step, pair in zip(steps, pairs, strict=True)]
     return np.maximum(1, 1.4826**2 / 2 * np.square(medians))[:, None, None, None]
+
+
+def _push(predicted: NDArray, residual: NDArray, weight: NDArray) -> tuple[NDArray, NDArray]:
+    """Displacement in pixels, (k, 2), that explains residuals (k, 2, h, w) best, and its standard error."""
+    k = len(residual)
+    slopes = np.stack([-np.gradient(predicted, axis=axis) for axis in (2, 3)], axis=1).reshape(k, 2, -1)
+    weighted = slopes * weight.reshape(k, 1, -1)
+    inverse = np.linalg.inv((weighted @ slopes.transpose(0, 2, 1)).astype(float) + 1e-9 * np.eye(2))
+    along = weighted @ residual.reshape(k, -1, 1)
+    number = np.maximum(np.count_nonzero(weight, axis=(1, 2, 3)), 1)
+    misfit = np.maximum(np.sum(weight * residual**2, axis=(1, 2, 3)) / number, 1)
+    return (inverse @ along)[..., 0], np.sqrt(misfit[:, None] * np.diagonal(inverse, axis1=1, axis2=2))
 
 
 def _significant(residual: NDArray, variance: NDArray, usable: NDArray) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ import math
 import warnings
 import zipfile
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -29,7 +29,7 @@ from zwfs._propagator import propagator, split
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import FileError, broken
 from zwfs.frames._errors import Excess, sideways, slopes_of
-from zwfs.frames._exposures import Exposures
+from zwfs.frames._exposures import SURE, Exposures
 from zwfs.frames._fit import BenchFit, fit_bench
 from zwfs.frames._fitted import WIDEST, smooth_phases
 from zwfs.frames._follow import checked_follow, followed
@@ -90,6 +90,8 @@ class Calibration(Immutable):
         at neighbouring points.
     displacements : ndarray, shape (n_states, 2), pixels
         Rows and columns by which the rim of the pupil on the calibration's frames differs from the model.
+    around : ndarray, shape (2,)
+        Background of the calibration's frames, as that of `Phases`, to which that of other frames is compared.
     residual : float
         Rms difference of the calibration's frames and their model, the largest of all states, as in `Phases`.
     saturation : float, counts
@@ -127,6 +129,7 @@ class Calibration(Immutable):
     unexplained: NDArray[np.float32]
     slopes: NDArray[np.float64]
     displacements: NDArray[np.float64]
+    around: NDArray[np.float64] = field(default_factory=lambda: np.zeros(2))
     residual: float = 0.0
     light_ratio: float = 1.0
     saturation: float = np.inf
@@ -150,6 +153,7 @@ class Calibration(Immutable):
             "amplitude": grid, "good": grid, "bad": camera, "places": (2, 2, *grid),
             "dark": camera, "background": (2,), "unit": (2,), "weights": (2, 2, *grid), "offset": (2, *grid),
             "light": (2,), "unexplained": (n_states, *grid), "slopes": (n_states,), "displacements": (n_states, 2),
+            "around": (2,),
         }  # fmt: skip
         for name, size in sizes.items():
             array = getattr(self, name)
@@ -375,8 +379,12 @@ class Calibration(Immutable):
         frames = np.maximum(ideal_frames(measurement)[inner], 0)[np.newaxis].astype(np.float32)
         phase = calibration._work.solve(frames, good[np.newaxis]).phase
         errors = sideways(calibration.sensor, phase[0], frames[0], good)[np.newaxis]
-        shift = calibration._work.displaced(phase, frames, good[np.newaxis])[0]
-        residual, ratio = calibration._work.compared(phase, frames, good[np.newaxis])
+        work, steady = calibration._work, calibration._work.steady(phase)
+        shift = work.displaced(steady, frames, good[np.newaxis])[0]
+        residual, ratio = work.compared(phase, frames, good[np.newaxis])
+        exposure = np.stack([image.counts for image in images])[np.newaxis] + dark
+        level, error = work.background(work.cleaned(exposure, np.inf, good)[0], steady, calibration.unit)
+        around = np.where(np.abs(level) > SURE * error, level, 0)[0, 0]
         if remark := doubt(measurement, phase[0]):
             warnings.warn(remark, stacklevel=3)
         # In one image a phase at the edge looks like a shift.
@@ -390,7 +398,7 @@ class Calibration(Immutable):
             )
         return replace(
             calibration, unexplained=errors, slopes=slopes_of(phase, good), displacements=shift,
-            residual=float(residual[0]), light_ratio=float(ratio[0]),
+            around=around, residual=float(residual[0]), light_ratio=float(ratio[0]),
         )  # fmt: skip
 
     def save(self, path: str | Path) -> None:
@@ -480,8 +488,8 @@ class Calibration(Immutable):
             of the calibration would have with the light and the noise of this one. With a `bench` it is 1.4 times
             the noise of this frame, the residual of the calibration or 0.0025, whichever is largest.
         judge : bool
-            Whether to compare the frames with their model. Without it residual and displacement are NaN, no frame
-            is inconsistent or moved, and the light follows from the mean of the frames alone.
+            Whether to compare the frames with their model. Without it residual, displacement and background are
+            NaN, no frame is inconsistent or moved, and the light follows from the mean of the frames alone.
         method : Reconstructor, optional
             Replaces the phase-shifted iteration, such as ``zwfs.Linear(calibration.sensor, modes)``. With a
             `bench`, its frames are those of the last correction.

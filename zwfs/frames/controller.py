@@ -26,7 +26,17 @@ from zwfs._arrays import Kind, read_only
 from zwfs._system import path_of, write_file
 from zwfs.frames._blocks import broken
 from zwfs.frames._fits import FIRST_BYTES, fits_content, fits_module
-from zwfs.frames._pokes import Inverse, Pokes, Signals, faintest, image_shape, phases_of, roughness
+from zwfs.frames._pokes import (
+    Inverse,
+    Pokes,
+    Signals,
+    beyond_noise,
+    faintest,
+    image_shape,
+    phases_of,
+    roughness,
+    surroundings,
+)
 from zwfs.reconstructors import MaximumLikelihood
 from zwfs.reconstructors._tracking import Tracking
 
@@ -39,8 +49,8 @@ _STILL = 1e-3  # radian rms of the flat mirror's phase, below which it needs no 
 _METHODS = "linear", "phase-shifted", "likelihood"
 _SUFFIXES = ".npz", ".fits"
 # Arrays and numbers of a file; the numbers with the value of one that is missing, since FITS has no infinity.
-_ARRAYS = "matrix", "reference", "mask", "dark", "interaction"
-_NUMBERS = {"light": np.inf, "noise": 0.0, "gain": 1.0, "n_kept": 1.0, "saturation": np.inf}
+_ARRAYS = "matrix", "reference", "mask", "dark", "interaction", "around"
+_NUMBERS = {"light": np.inf, "noise": 0.0, "gain": 1.0, "n_kept": 1.0, "saturation": np.inf, "stray": 0.0}
 _PHASE_ARRAYS = "modes", "flat", "calibration"
 _PHASE_NUMBERS = {"faintest": 0.0, "rcond": 0.0, "gain": 1.0, "likelihood": 0.0, "n_iterations": 1.0}
 
@@ -68,9 +78,11 @@ def make_controller(
         )  # fmt: skip
     interaction = signals.difference.T / poke
     inverse = Inverse.of(interaction, rcond, signals.noise * math.sqrt(signals.shares[0]) / poke)
+    around, stray = surroundings(calibration, pokes.flat, pokes.good)
     return Controller(
         gain * inverse.matrix, signals.reference, signals.mask, signals.dark, interaction, light=signals.light,
         noise=signals.noise, gain=gain, n_kept=len(inverse.directions), saturation=calibration.saturation,
+        around=around, stray=stray,
     )  # fmt: skip
 
 
@@ -105,20 +117,27 @@ class Controller:
         Directions of the commands that are inverted.
     saturation : float, counts
         Pixels that reach it are bad.
+    around, stray : array_like, shape of the mask, and float, counts, optional
+        Weights of pixels around the pupils, and what they make of the dark: sum(around * counts) - stray is the
+        uniform light that the frame of the flat mirror did not have.
 
     Attributes
     ----------
     flux : float
         Light of the last frame over that of the flat mirror.
+    background : float
+        Uniform light of the last frame that the flat mirror did not have, over the mean of its pixels. It is not
+        subtracted; 0 if the camera image shows too little around the pupils.
     n_bad : int
         Pixels of the last frame that were replaced.
     lost : bool
-        Whether the last frame had no light: then the commands are 0.
+        Whether the last frame had no light, or no pupil: then the commands are 0.
     """
 
     def __init__(
         self, matrix: ArrayLike, reference: ArrayLike, mask: ArrayLike, dark: ArrayLike, interaction: ArrayLike,
         *, light: float, noise: float, gain: float, n_kept: int, saturation: float = np.inf,
+        around: ArrayLike | None = None, stray: float = 0.0,
     ) -> None:  # fmt: skip
         flags = _check.plain_array("mask", mask)
         self.mask = read_only(_check.flag_map("mask", flags, flags.shape).copy())
@@ -126,8 +145,11 @@ class Controller:
             raise ValueError(f"mask has shape {self.mask.shape}: expected (ny, nx) or (2, ny, nx)")
         if not self.mask.any():
             raise ValueError("mask is False at all pixels: expected some to be True")
-        self._pixels = np.flatnonzero(self.mask)
-        n, n_commands = len(self._pixels), len(np.atleast_1d(matrix))
+        n, n_commands = int(np.count_nonzero(self.mask)), len(np.atleast_1d(matrix))
+        around = np.zeros(self.mask.shape) if around is None else around
+        self.around, self.stray = _single("around", around, self.mask.shape), _check.number("stray", stray)
+        far = np.flatnonzero(self.around)
+        self._pixels, self._weights = np.concatenate([np.flatnonzero(self.mask), far]), self.around.ravel()[far]
         self.matrix = _single("matrix", matrix, (n_commands, n))
         self.reference, self.dark = _single("reference", reference, (n,)), _single("dark", dark, (n,))
         self.interaction = _single("interaction", interaction, (n, n_commands))
@@ -136,14 +158,16 @@ class Controller:
         self.gain = _check.number("gain", gain, 0, 2, open_low=True)
         self.n_kept = _check.integer("n_kept", n_kept, 1, n_commands)
         self.saturation = _check.number_or_inf("saturation", saturation)
-        self.flux, self.n_bad, self.lost = 1.0, 0, False
-        self._faintest = faintest(self.noise, n) * self.light
-        self._ones = np.ones(n, np.float32)
-        self._raw, self._signal, self._expected = np.empty((3, n), np.float32)
+        self.flux, self.background, self.n_bad, self.lost = 1.0, 0.0, 0, False
+        self._faintest, self._mean = faintest(self.noise, n) * self.light, self.light / n
+        self._ones, self._expected = np.ones(n, np.float32), np.empty(n, np.float32)
+        self._darks = np.concatenate([self.dark, 0 * self._weights])
+        self._raw, self._values = np.empty_like(self._darks), np.empty_like(self._darks)
+        self._signal, self._far = self._values[:n], self._values[n:]
 
     def __repr__(self) -> str:
         return (
-            f"Controller({len(self._pixels)} pixels to {self.n_commands} commands, {self.n_kept} directions, "
+            f"Controller({len(self.reference)} pixels to {self.n_commands} commands, {self.n_kept} directions, "
             f"gain={self.gain:g})"
         )
 
@@ -192,13 +216,16 @@ class Controller:
             self._raw = np.empty(len(self._pixels), counts.dtype)
         signal = self._signal
         counts.take(self._pixels, out=self._raw, mode="clip")
-        signal[:] = self._raw
-        signal -= self.dark
-        light = float(signal @ self._ones)
+        self._values[:] = self._raw
+        self._values -= self._darks
+        light, level = float(signal.dot(self._ones)), float(self._far.dot(self._weights)) - self.stray
         self.n_bad = 0
         if not (abs(light) < _check.LARGEST and self._raw.max() < self.saturation):
             light = self._repaired()
-        self.flux, self.lost = light / self.light, not light > self._faintest
+        self.flux, self.background = light / self.light, level / self._mean
+        self.lost = not light > self._faintest or bool(
+            2 * self.background > self.flux and beyond_noise(level, self._weights, self._far)
+        )
         if self.lost:
             out[:] = 0
             return out
@@ -211,7 +238,7 @@ class Controller:
         """Replace bad pixels of the signal by the reference, and return the light of all."""
         signal = self._signal
         with np.errstate(invalid="ignore"):
-            bad = ~((np.abs(signal) < _check.LARGEST) & (self._raw < self.saturation))
+            bad = ~((np.abs(signal) < _check.LARGEST) & (self._raw[: len(signal)] < self.saturation))
         self.n_bad = int(np.count_nonzero(bad))
         share = float(self.reference[~bad].sum())
         light = float(signal[~bad].sum()) / share if share > 0 else 0.0
@@ -221,10 +248,10 @@ class Controller:
     def save(self, path: str | Path) -> None:
         """Write the controller as NPZ or FITS, by the end of the name, in one step.
 
-        Both hold `matrix`, `reference`, `mask` (1 and 0), `dark` and `interaction` of this object under their
-        names: as the NPY files of which an NPZ file consists, or as images of FITS units, with the matrix first.
-        The numbers `light`, `noise`, `gain`, `n_kept` and `saturation` are arrays without an axis in NPZ. In FITS
-        they are keywords of the first header, cut to 8 letters; one that is infinite is left out.
+        Both hold `matrix`, `reference`, `mask` (1 and 0), `dark`, `interaction` and `around` of this object under
+        their names: as the NPY files of which an NPZ file consists, or as images of FITS units, with the matrix
+        first. The numbers `light`, `noise`, `gain`, `n_kept`, `saturation` and `stray` are arrays without an axis
+        in NPZ. In FITS they are keywords of the first header, cut to 8 letters; one that is infinite is left out.
 
         Raises
         ------
@@ -266,7 +293,7 @@ class PhaseController:
         Of the last frame, with which the next one starts; 0 outside the pupil.
     sigma : ndarray, shape (n_commands,)
         With the likelihood: standard error of the commands of the last frame, before the gain; else NaN.
-    flux, n_bad, lost : float, int and bool
+    flux, background, n_bad, lost : float, float, int and bool
         As those of `Controller`. The bad pixels are those that are good in the calibration.
     """
 
@@ -301,10 +328,13 @@ class PhaseController:
         self._stray = float(np.mean(self._work.offset.reshape(2, -1) @ self._mean))
         self._light: NDArray[np.float32] = np.ones(2, np.float32)
         self._light = self._on_grid(flat)[1] / np.float32(level.flux)
+        self._mean_light = float(self._light.mean())
         self._change, self._turns = np.empty((2, len(self._points)), np.float32)
         self.phase: NDArray[np.float32] = level.filled
         self.sigma = np.full(self.n_commands, np.nan)
-        self.flux, self.n_bad, self.lost = float(level.flux), 0, False
+        self.flux, self.background, self.n_bad, self.lost = float(level.flux), 0.0, 0, False
+        around, self._stray_around = surroundings(calibration, flat, np.isfinite(flat))
+        self._far, self._weights = np.flatnonzero(around), around[around != 0]
         self._likelihood: MaximumLikelihood | None = None
         if likelihood:
             self._directions = inverse.directions
@@ -325,7 +355,12 @@ class PhaseController:
         counts = _check.real_frame("counts", counts, image_shape(self._calibration))
         out = _check.destination("out", out, (self.n_commands,))
         frames, self.flux, self.n_bad = self._frames(counts, self._brightness() / self._flat_brightness)
-        self.lost = not self.flux > self._faintest
+        far = counts.take(self._far).astype(np.float32)
+        level = float(far.dot(self._weights)) - self._stray_around
+        self.background = level / self._mean_light
+        self.lost = not self.flux > self._faintest or (
+            2 * self.background > self.flux and beyond_noise(level, self._weights, far)
+        )
         if self.lost:
             out[:] = 0
             return out

@@ -30,11 +30,13 @@ class Flag(IntFlag):
     INCONSISTENT
         The residual exceeds 2.5 times that of the calibration's frames, more in faint light, or the call's limit.
         With a fitted bench, it exceeds 1.4 times the noise: the frame is not the one that its phase predicts.
+        Or the background has risen by more than 3 % of a clear frame and 5 standard errors.
     NOT_CONVERGED
         The iteration used all its steps.
     MOVED
         The images have moved on the camera since the calibration, by more than 0.1 pixel and 5 standard errors.
-        With `follow`: such a displacement remains.
+        With a fitted bench, also if a displacement explains what its prediction misses. With `follow`: such a
+        displacement remains.
 
     Examples
     --------
@@ -74,6 +76,10 @@ class Phases(PhaseResult):
         Rows and columns by which the pupil has moved since the calibration, from its rim on both images. It comes
         out at 0.5 to 1.2 times the true value. With `follow` it holds the shift that was undone and what remains,
         to 0.15 pixel. NaN if the frame is lost, or was not judged.
+    background : ndarray of float32, shape (..., 2)
+        Uniform light that both images have gained since the calibration; 1 = mean of a clear frame, with the light
+        of this exposure. It is measured around the pupils, and not subtracted. NaN if the camera image shows too
+        little there, if the frame is lost, or was not judged.
     n_iterations, n_unsolved, flags : ndarray of int, shape (...)
         Iterations, points whose equations had no unique solution, and the sum of `Flag`; 0 is a good frame.
     sigma : ndarray, shape (..., ny, nx), radian, or None
@@ -94,6 +100,7 @@ class Phases(PhaseResult):
     n_saturated: NDArray[np.int64]
     residual: NDArray[np.float32]
     displacement: NDArray[np.float32]
+    background: NDArray[np.float32]
     n_iterations: NDArray[np.int64]
     n_unsolved: NDArray[np.int64]
     flags: NDArray[np.int64]

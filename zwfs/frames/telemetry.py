@@ -237,7 +237,8 @@ class _Job:
     def _row_type(self) -> np.dtype:
         columns: list[tuple] = [
             ("FRAME", ">i8"), ("FILE", ">i4"), ("INDEX", ">i8"), ("FLAGS", ">i2"), ("FLUX", ">f4"),
-            ("RESIDUAL", ">f4"), ("SHIFT", ">f4", (2,)), ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4"),
+            ("RESIDUAL", ">f4"), ("SHIFT", ">f4", (2,)), ("BACKGR", ">f4", (2,)),
+            ("NBAD", ">i4"), ("NSATUR", ">i4"), ("NITER", ">i4"),
         ]  # fmt: skip
         columns += [("SIGMA", ">f4")] * self.has_sigma
         if self.matrix is not None:
@@ -346,7 +347,7 @@ class _Job:
         for name, values in self.keywords.items():
             rows[name] = values[files]
         rows["FLAGS"], rows["FLUX"], rows["RESIDUAL"] = phases.flags, phases.flux, phases.residual
-        rows["SHIFT"] = phases.displacement
+        rows["SHIFT"], rows["BACKGR"] = phases.displacement, phases.background
         rows["NBAD"], rows["NSATUR"], rows["NITER"] = phases.n_bad, phases.n_saturated, phases.n_iterations
         lost = phases.flags & Flag.LOST > 0
         if sigma is not None:

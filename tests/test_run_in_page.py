@@ -334,7 +334,8 @@ def test_own_frames_in_npy_are_reconstructed_and_stay_on_this_computer(opened, t
         field.set_input_files(tmp_path / f"{name}.npy")
     assert page.run().startswith("Done"), page.said
     files = {name: [f"{name}.npy"] for name in kinds}
-    assert_equal_columns(page.columns(), native("own_frames", values | files, "own_phase", tmp_path), 1e-6)
+    # The page rounds otherwise, in single precision: some 1e-6 rad, mostly of piston, which no image shows.
+    assert_equal_columns(page.columns(), native("own_frames", values | files, "own_phase", tmp_path), 1e-5)
     assert not [
         url for url in page.asked if not url.startswith(("http://127.0.0.1", "blob:", "data:", page.place))
     ]

@@ -187,9 +187,9 @@ class Exposures:
             poor = poor[best.cost[poor] > self._enough]
 
     def _compared(self, trial: Trial) -> tuple[NDArray, ...]:
-        """Residuals, displacements and whether one is significant, backgrounds and whether one is.
+        """Residuals, displacements, flags of significant ones, backgrounds, and flags of significant ones.
 
-        NaN where an exposure is lost or not judged.
+        Numbers are NaN where an exposure is lost or not judged.
         """
         usual, work, k = self._of.displacements, self._work, len(self.lit)
         lit = slice(None) if self.lit.all() else self.lit  # a slice copies nothing

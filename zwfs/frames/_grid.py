@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 _FAR = 16  # pixels to which an edge is repeated
 _REACH = 12  # pixels around the pupil that its splines need: farther ones weigh less than 2e-7
 _RIM = 2  # pixels on both sides of the edge of the pupil, from which its place follows
-_AWAY = 3  # pixels from the light of a pupil, from which on pixels show the background
-_FEWEST, _MOST = 16, 200  # of these pixels
-_STEEPEST = 1.2  # light of these pixels over that of a model, without a background
+_AWAY = 3  # pixels between a pupil and the nearest pixels in which the background is measured
+_FEWEST, _MOST = 16, 200  # number of these far pixels
+_STEEPEST = 1.2  # largest light of a far pixel without background, over that of its model
 _OUTLYING = 4.0  # residual of a line over their rms, above which a pixel does not count
 _CUT = _REACH - 1 - _RIM  # of these, those without a coefficient of a spline in the pupil or its rim
 _NOISE = 0.2  # of the signal, in squares: the inverse of a blur goes no further

@@ -26,7 +26,7 @@ _SILENT = 1e-6  # response to a poke over that of a typical one, in squares: not
 _UNSEEN = 1.05  # singular value over that of noise alone, below which a direction is noise
 _LOST = 5.0  # standard errors of the light, below which a frame has none
 _MOST_AROUND = 128  # pixels that show the background
-_FLAT = 0.01  # relative variance of their light in the frame of the flat mirror, with which they do not
+_FLAT = 0.01  # variance of their light over its mean square: with less, light and background look the same
 _FEWEST = 0.8  # of the pixels that the pupil covers, which are good in all frames of the pokes
 
 
@@ -220,10 +220,10 @@ def _pixels(calibration: Calibration) -> NDArray[np.bool_]:
 
 
 def surroundings(calibration: Calibration, flat: NDArray, good: NDArray) -> tuple[NDArray[np.float32], float]:
-    """Weights of pixels around the pupils, of the shape of an exposure, and what they make of the dark, counts.
+    """Weights with which a frame sums up to its background, and that sum of the dark, counts, to subtract.
 
-    The weighted sum of a frame, less that of the dark, is the background: the constant of a line from the light of
-    the frame of the flat mirror to that of the frame. The weights are 0 where too few pixels show it.
+    The background is the constant of a line: the light of far pixels against that in the frame of the flat mirror.
+    All weights are 0 if these pixels cannot show it.
     """
     pixels = np.unique(calibration._work.far_on_camera)
     pixels = pixels[good.ravel()[pixels]]
@@ -244,7 +244,7 @@ def dark_of(calibration: Calibration) -> NDArray[np.float64]:
 
 
 def beyond_noise(level: float, weights: NDArray, far: NDArray) -> bool:
-    """Whether a background is more than the scatter of pixels explains."""
+    """Whether a background exceeds 5 standard errors, by the scatter of its pixels."""
     return level > _LOST * float(np.linalg.norm(weights) * far.std())
 
 

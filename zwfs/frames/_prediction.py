@@ -33,8 +33,8 @@ _N_CORRECTIONS = 2  # the next ones gain little
 _SMOOTHING = 0.5  # pixels rms, of residuals
 _AROUND = 2.0  # pixels rms, of the neighbours whose residuals are compared with their noise
 _FULLY_LIT = 0.9  # share of the light of a pixel
-# Pixels and standard errors of a displacement that residuals show. It is a tenth to nine tenths of the true one,
-# as the phase follows it, and errors of the model pretend up to 0.05.
+# Smallest displacement that counts, pixels and standard errors. Residuals show a tenth to nine tenths of the true
+# one, because the phase follows it. Errors of the model look like up to 0.05 pixel.
 _MOVED_BY, _SURE = 0.07, 5.0
 _FEWEST = 30  # points without a neighbour that is lit in part: with fewer, edges count, too
 

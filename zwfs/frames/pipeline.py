@@ -42,7 +42,7 @@ _DARK = 0.1  # of the largest amplitude: a point with less is outside
 _LIT = 0.85  # of the amplitude around it: a point with less is dark or partly lit
 _HALF = 0.7  # of the amplitude around it: a point with less is lit in half or less
 _ROUGHLY = 10  # iterations
-_SURELY = 0.92  # part of the misfit, with which another distribution of the gain is better
+_SURELY = 0.92  # of the misfit: another split of the gain must come below it
 _DOUBTFUL, _UNLIKE = 0.08, 4.0  # of the light, and of the noise of the frames: a larger residual is worth a word
 _SECOND = 1.0, -2.0, 1.0  # a smooth phase hardly changes the second differences
 MOST_BAD = 0.2  # of the points of the pupil: with more bad ones, the reference wave is guesswork
@@ -172,7 +172,7 @@ class Measurement:
     gain : ndarray, shape (2, ny', nx') or (2, 1, 1)
         Smooth gain of each arm, by the ratio of the clear frames; `intensity` still contains it.
     share : float or None
-        Part of the ratio of the gains that the first arm has; None if the light before the masks is even.
+        Share of the first arm in the ratio of the gains; None if the light before the masks is even.
     """
 
     registered: RegisteredFrames
